@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from edge.errors import UsageError
 from edge.pipeline.pose_queue import PoseError, PoseQueue
 from edge.sinks.registry import needs_cyclone_dds
-from edge.sinks.ros2.messages import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED, base_topic
+from edge.sinks.ros2.messages import TYPES, base_topic
 from edge.sinks.zenoh import close_session, open_session, opening, parsed_target
 from firmware_bridge.errors import CdrError
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose, TimedPose
@@ -182,7 +182,8 @@ class Ros2Poses:
         self._end = GuardCondition(self._participant)
         self._waiting = WaitSet(self._participant)
         self._waiting.attach(self._end)
-        kinds = (POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED)
+        names = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
+        kinds = [TYPES[f"geometry_msgs/{name}"] for name in names]
         self._readers = [(reader(self._participant, topic, kind, _KEPT, reliable=False), kind) for kind in kinds]
         state = SampleState.NotRead | ViewState.Any | InstanceState.Any
         self._conditions = [ReadCondition(one, state) for one, _ in self._readers]

@@ -49,7 +49,8 @@ SLOWEST_PERIOD_NS: Final = 250_000_000  # time between two scans of the slowest 
 # ---- A sensor ----
 
 SENSOR_SILENT_NS: Final = 2 * SLOWEST_PERIOD_NS
-"""Time without a scan after which a sensor is reported silent, if another one goes on, and drawn grey."""
+"""Time without a scan after which a sensor is reported silent, if another one goes on, and drawn grey; and time without
+a pose, after one that does not hold, after which their source is: some scans were without one by then."""
 TAPS_FORGOTTEN_NS: Final = 4 * SLOWEST_PERIOD_NS
 """Time without a scan after which earlier taps are dropped: a tap is over by then."""
 SCAN_GIVEN_UP_NS: Final = 4 * SLOWEST_PERIOD_NS
@@ -57,9 +58,6 @@ SCAN_GIVEN_UP_NS: Final = 4 * SLOWEST_PERIOD_NS
 SERVER_READING_OLD_NS: Final = 4 * SLOWEST_PERIOD_NS
 """Age at which a reading from the vendor's server belongs to a silent sensor."""
 TAXEL_SILENT_SCANS: Final = 50  # scans without a taxel after which its loss is reported, and zeroing goes on without it
-POSES_SILENT_NS: Final = SENSOR_SILENT_NS
-"""Time without a pose, after one that does not hold, after which its source is reported silent: some scans were without
-one by then."""
 LATEST_SCAN_S: Final = 2.0  # age of the last scan at the end of its watch above which the doctor reports a sensor
 
 # ---- A link ----

@@ -13,8 +13,7 @@ from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.links.registry import FORMS as SOURCES
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.pad_constants import PAD_RANGES
-from firmware_bridge.zeroing.baseline import FEWEST_SCANS
-from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
+from firmware_bridge.zeroing.baseline import FEWEST_RECORDED, FEWEST_SCANS
 
 _SETTINGS: Final[dict[Any, Any]] = {bool: {"action": "store_true"}, list: {"action": "append", "default": []}}
 """Settings of argparse for an option without a value, and for one that may be repeated."""
@@ -55,15 +54,6 @@ SENSOR: Final = (
     Option("--rate-hz R", positive, "scans a second at which a recording is played; for a device, its expected rate"),
     Option("--force", bool, "use a sensor file of an emulated sensor on a real one all the same"),
 )
-_READ: Final = Group("sensor",
-    *SENSOR,
-    Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline (default: measure them at the "
-           "start)"),
-    Option("--give-up-s T", not_negative, "end when the source has been lost for T seconds; 0: at once "
-           "(default: never)"),
-    Option("--poses P", list, "positions of the pad, which a robot sends: zenoh[:KEY] or ros2:TOPIC; for one of "
-           "several sensors SENSOR=P; repeat it for several"),
-)
 RESULTS: Final = (
     Group("model",
         Option("--model M", str, "bundled model, of those that edge-sr models lists, or model file (default "
@@ -96,7 +86,18 @@ RESULTS: Final = (
         _runtime("every_scan", bool),
     ),
 )
-RUN: Final = (_READ, *RESULTS)
+RUN: Final = (
+    Group("sensor",
+        *SENSOR,
+        Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline (default: measure them at the "
+               "start)"),
+        Option("--give-up-s T", not_negative, "end when the source has been lost for T seconds; 0: at once "
+               "(default: never)"),
+        Option("--poses P", list, "positions of the pad, which a robot sends: zenoh[:KEY] or ros2:TOPIC; for one of "
+               "several sensors SENSOR=P; repeat it for several"),
+    ),
+    *RESULTS,
+)
 # fmt: on
 
 
@@ -255,9 +256,7 @@ examples:
         (
             Group(
                 "map",
-                Option(
-                    "--out FILE", Path, "file for the layers of the map (default %(default)s)", default=Path("map.npz")
-                ),
+                Option("--out FILE", Path, "file for the map's layers (default %(default)s)", default=Path("map.npz")),
                 Option("--png FILE", Path, "file for a picture of contact and height"),
                 Option("--size-mm L", positive, "length of its sides in mm (default %(default)g)", default=SIZE_MM),
                 Option("--px-per-mm N", positive, "pixels of the map per mm (default %(default)g)", default=PX_PER_MM),

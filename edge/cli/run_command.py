@@ -41,8 +41,8 @@ from edge.api import (
     save_baselines,
 )
 from edge.cli.option_table import runtime_options
-from edge.cli.user_commands import user_commands
 from edge.errors import SinkError
+from edge.pipeline.commands import user_commands
 from edge.pipeline.run_statistics import silence_hint
 from edge.pipeline.sink import check_new
 from edge.sinks.registry import check_apart

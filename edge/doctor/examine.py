@@ -14,7 +14,7 @@ from edge.doctor import link_checks
 from edge.doctor import taxel_checks as taxels
 from edge.doctor.findings import Finding, judged
 from edge.doctor.link_checks import LineFacts
-from edge.doctor.taxel_checks import FEWEST_SCANS, Samples
+from edge.doctor.taxel_checks import Samples
 from edge.errors import UsageError
 from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines, with_recorded
 from edge.validation import check_baselines, check_positive
@@ -68,7 +68,8 @@ class Examined:
 def judge(watched: Watched, unix_time_s: float) -> Examined:
     """Return all findings of a watch; `unix_time_s` dates the baselines, in [s] since 1970, NaN if unknown."""
     samples = {name: Samples(scans) for name, scans in sorted(watched.scans.items()) if len(scans) > 1}
-    enough = {name: one for name, one in samples.items() if one.scans >= FEWEST_SCANS}
+    fewest = 50  # scans that are judged: of fewer neither noise nor rate is known well enough
+    enough = {name: one for name, one in samples.items() if one.scans >= fewest}
     half_silent = {name for name, one in enough.items() if 2 * np.count_nonzero(one.living) <= one.living.size}
     facts, counters, duration_s = watched.facts, watched.counters, watched.duration_s
     taxel_count = watched.model.geometry.taxel_count
@@ -81,7 +82,7 @@ def judge(watched: Watched, unix_time_s: float) -> Examined:
         link_faulty = any(finding.verdict == "wrong" for finding in findings)
         remedy = "see above" if link_faulty else "is the sensor powered, and is nothing else reading it?"
         scans = f"{sum(one.scans for one in samples.values())} scans"
-        findings.append(Finding("scans", "wrong", scans, f"at least {FEWEST_SCANS} of a sensor", remedy))
+        findings.append(Finding("scans", "wrong", scans, f"at least {fewest} of a sensor", remedy))
     wrong_map = id_map is not None and id_map.verdict == "wrong"
     last_ns = (scans[-1].time_ns for scans in watched.scans.values() if scans)
     newest_ns = watched.until_ns if watched.until_ns is not None else max(last_ns, default=0)

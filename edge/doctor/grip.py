@@ -13,7 +13,6 @@ from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 ASK: Final = "Let the gripper close on something firm, so that both pads press it, hold it for two seconds, and open."
 HELD_SCANS: Final = 100  # scans of each pad in the grip, before its end is waited for
 FREE_SCANS: Final = 20
-GRIP_ERROR: Final = 0.045  # 90 % of the ratio of two pads' summed z; seven real grips scatter by 0.027
 
 
 class Grip:
@@ -82,5 +81,6 @@ class Grip:
         for name, partner, factor in ((second, first, 1 / ratio), (first, second, ratio)):
             if partner in weighed:
                 per_newton, error = weighed[partner]
-                self.weighed = {name: Weighed(per_newton * factor, math.hypot(error, GRIP_ERROR, off_share))}
+                # Half of the 90 % interval of the ratio: seven real grips scatter by 0.027.
+                self.weighed = {name: Weighed(per_newton * factor, math.hypot(error, 0.045, off_share))}
         return findings

@@ -9,17 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.doctor.guided_press import ASK_WEIGHT, CORNERS
+from edge.perception.result import NOISE_COUNTS
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
 
 WATCHED_S: Final = 5.0  # for which the free pad is watched
-_LATE_S: Final = 1.0  # from a request to what a person does
-_PRESS_COUNTS: Final = 5000.0  # summed z of a press
-_COUNTS_PER_N: Final = 1176.0  # of the average sensor
 _WEIGHT_G: Final = 200.0
-_NOISE_COUNTS: Final = 2.0
-_RATE_HZ: Final = 100.0
 
 
 class Rehearsal(Emulator):
@@ -31,7 +27,7 @@ class Rehearsal(Emulator):
         self._load = self._next = np.zeros(USPA44.scan_shape)
         self._next_s = 0.0
         rest = np.array([32_700, 32_800, 37_400])[:, None, None] + 37 * np.arange(16).reshape(4, 4)
-        free = Recording(Path("rehearsal"), (Track("4", rest[None].astype(np.int32), None),), _RATE_HZ)
+        free = Recording(Path("rehearsal"), (Track("4", rest[None].astype(np.int32), None),), rate_hz=100.0)
         super().__init__([free], played=self._scans)
 
     def answer(self, request: str) -> None:
@@ -40,16 +36,17 @@ class Rehearsal(Emulator):
         corner = next((name for name in CORNERS if name in request), None)
         if corner is not None:
             row, col = (0.3 if side in corner else 2.7 for side in ("top", "left"))  # a little inside of it
-            load[2] = _PRESS_COUNTS * _pressed(row, col)
+            load[2] = 5000 * _pressed(row, col)  # counts
         elif request.startswith("Still pressing"):
             z = self._next[2]
             row, col = np.unravel_index(z.argmax(), z.shape)
             load[:] = 0.2 * z * (1 if col < 2 else -1), 0.2 * z * (1 if row < 2 else -1), z
         elif request.startswith("Lay"):
-            load[2] = _WEIGHT_G / 1000 * 9.80665 * _COUNTS_PER_N / USPA44.taxel_count
+            # By counts per newton of the average sensor.
+            load[2] = _WEIGHT_G / 1000 * 9.80665 * 1176 / USPA44.taxel_count
         elif request.endswith(ASK_WEIGHT):
             self._typed = f"{_WEIGHT_G:g}"
-        self._next_s, self._next = time.monotonic() + _LATE_S, load
+        self._next_s, self._next = time.monotonic() + 1.0, load  # a person takes a second
 
     def typed_line(self) -> str | None:
         """Return what is typed since the last call, or None."""
@@ -60,7 +57,7 @@ class Rehearsal(Emulator):
         noise = np.random.default_rng(0)
         while True:
             self._load = self._next if time.monotonic() >= self._next_s else self._load
-            reading = track.counts[0] + self._load + noise.normal(0, _NOISE_COUNTS, USPA44.scan_shape)
+            reading = track.counts[0] + self._load + noise.normal(0, NOISE_COUNTS, USPA44.scan_shape)
             yield np.rint(reading).astype(np.int32)
 
 

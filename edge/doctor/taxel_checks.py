@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from edge.doctor.findings import Finding, graded, judged
 from edge.perception.contact_options import OFF_COUNTS
-from edge.perception.taps import NOISE_COUNTS
+from edge.perception.result import NOISE_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.scan import ABSENT, Scan
@@ -16,7 +16,6 @@ from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
 
 AROUND: Final = 16  # scans before and after a scan that show whether it alone was late
-FEWEST_SCANS: Final = 50
 
 
 class Samples:

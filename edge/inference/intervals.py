@@ -20,7 +20,6 @@ REGIONS: Final = ("inside", "edge", "near", "far")
 """Regions of a pattern: inside the contact, the pixels on both sides of its outline, up to NEAR_MM outside, the
 rest."""
 NEAR_MM: Final = 2.0
-LARGEST_FACTOR: Final = 1e6
 
 
 def near_pixels(scale: int, pitch_mm: float) -> int:
@@ -66,7 +65,7 @@ def _is_percent(key: str) -> bool:
 def _is_factors(row: Any) -> bool:
     if not isinstance(row, list) or len(row) != len(REGIONS):
         return False
-    return all(type(one) in (int, float) and 0 < one <= LARGEST_FACTOR for one in row)
+    return all(type(one) in (int, float) and 0 < one <= 1e6 for one in row)
 
 
 def _grown(masks: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Forward model and checks of a model, by which the runtime decides whether a pattern is to be believed.
+"""Forward model and checks that a model brings along, by which `edge.perception.trust_check` decides what to believe.
 
 Two small networks tell whether any contact reads like that, by features that training and runtime make here. They do
 not depend on the force but for its size. The forward model gives the readings that a pattern makes: it explains a
@@ -208,12 +208,12 @@ def condensed(inputs: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 @lru_cache
-def pooling(length: int, cells: int = GRID) -> NDArray[np.float32]:
-    """Return the matrix (cells, length) of means over equal parts of a side."""
-    edges = np.linspace(0, length, cells + 1)
+def pooling(length: int) -> NDArray[np.float32]:
+    """Return the matrix (GRID, length) of means over equal parts of a side."""
+    edges = np.linspace(0, length, GRID + 1)
     places = np.arange(length)
     share = np.minimum(edges[1:, None], places + 1) - np.maximum(edges[:-1, None], places)
-    return (share.clip(0) / (length / cells)).astype(np.float32)
+    return (share.clip(0) / (length / GRID)).astype(np.float32)
 
 
 QUIET_UNITS: Final = 0.02

@@ -100,10 +100,6 @@ def _reached(grid: Grid, centre_mm: float, reach_mm: float) -> tuple[int, NDArra
     return first, ((np.arange(first, last + 1) - at) / grid.px_per_mm).astype(np.float32)
 
 
-CONTACT_LEVEL: Final = 0.5
-"""Share of a pattern's top from which a pixel counts as touched: where a blurred edge of a flat part truly lies."""
-
-
 class Evidence(NamedTuple):
     """Evidence of one pattern, in the pad's axes, and the height of its top above what it does not touch, in [mm].
 
@@ -187,8 +183,8 @@ class _Press:
 class ObjectMap:
     """Map of one object, a square of `size_mm` around `centre_mm` in the object's plane.
 
-    A pixel of a pattern counts as touched from the share `contact_level` of its top on. Raises a UsageError where the
-    size is out of range.
+    A pixel of a pattern counts as touched from the share `contact_level` of its top on: a blurred edge of a flat part
+    truly lies at a half. Raises a UsageError where the size is out of range.
     """
 
     def __init__(
@@ -197,7 +193,7 @@ class ObjectMap:
         px_per_mm: float = PX_PER_MM,
         *,
         centre_mm: tuple[float, float] = (0.0, 0.0),
-        contact_level: float = CONTACT_LEVEL,
+        contact_level: float = 0.5,
     ) -> None:
         count = round(size_mm * px_per_mm) if 0 < size_mm * px_per_mm <= MOST_PX else 0
         if not count:

@@ -36,17 +36,8 @@ REMEMBERED: Final = 64
 BOUND: Final = 0.25  # largest deviation of a gain from 1
 _FREEDOM: Final = 5.0  # degrees of freedom of Student's t, which weighs down contacts that no component explains well
 HELD_SCANS: Final = 200
-CONTRADICTED: Final = 6.0
-"""Disagreement of contacts with the measured gains from which these are another sensor's. The most that a sensor's own
-gains reached in a thousand contacts is 4.4, on 48 simulated sensors (docs/decisions.md)."""
-CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which that is decided
-_EVEN: Final = 1e-3
-"""Deviation to which each axis' mean is held: that of z is counts per newton, and of x and y the in-plane share."""
+CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which measured gains are found to be another sensor's
 _OPEN: Final = 1 / np.sqrt(3)  # prior deviation of a constant over half of its range: uniform within it
-_ARRAYS: Final = (
-    *("share", "means", "factors", "widening", "bias"),
-    *("names", "middles", "halves", "constant_widening"),
-)
 _Z: Final = slice(2 * TAXELS, 3 * TAXELS)
 _LINEAR: Final = GAINS + 2 * TAXELS + TAXELS + GAINS
 """Linear parameters beside the pad's constants: inverse gains, leans of x and y, unevenness of z, and offsets."""
@@ -82,7 +73,9 @@ def load_contact_model(path: Path = CONTACTS) -> ContactModel:
         EdgeError: the file cannot be read, or is of another pad.
     """
     try:
-        arrays = read_npz(path, _ARRAYS, 1 << 23)
+        of_contacts = ("share", "means", "factors", "widening", "bias")
+        of_constants = ("names", "middles", "halves", "constant_widening")
+        arrays = read_npz(path, (*of_contacts, *of_constants), 1 << 23)
         names, middles, halves = (arrays[name].tolist() for name in ("names", "middles", "halves"))
         constants = tuple(zip(names, middles, halves, strict=True))
         factors = arrays["factors"].astype(np.float64)
@@ -302,8 +295,8 @@ def _without(precision: NDArray[np.float64], dead: NDArray[np.bool_]) -> NDArray
 
 
 def _even_axes() -> NDArray[np.floating]:
-    """Return the precision that holds each axis' mean."""
-    return np.kron(np.eye(len(AXES)), np.full((TAXELS, TAXELS), (TAXELS * _EVEN) ** -2.0))
+    """Return the precision that holds each axis' mean within 0.001: of z counts per newton, else the in-plane share."""
+    return np.kron(np.eye(len(AXES)), np.full((TAXELS, TAXELS), (TAXELS * 1e-3) ** -2.0))
 
 
 def _prior(constants: int) -> NDArray[np.float64]:
@@ -368,7 +361,8 @@ class Learn:
         self.waiting, self._force_counts, self._seen = False, 0.0, 0
         learned = learner.learn(self._strongest, dead)
         enough = self._from_file and learner.contacts >= CONTRADICTED_CONTACTS
-        if check is not None and enough and learner.disagreement > CONTRADICTED:
+        # A sensor's own gains reached 4.4 at most in a thousand contacts, on 48 simulated sensors (docs/decisions.md).
+        if check is not None and enough and learner.disagreement > 6.0:
             if not check.suspected:
                 why = "its contacts contradict the gains of its sensor file: is it another sensor's file?"
                 self._report("suspected", why)

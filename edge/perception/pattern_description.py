@@ -19,11 +19,6 @@ from edge.perception.trust_check import SensorPad
 from firmware_bridge.pad_geometry import SensorGeometry
 
 _N_OF_KPA_MM2: Final = 1e-3
-_LEVEL_SCANS: Final = 200
-"""Scans over which the level of a contact is taken, two seconds at 100 Hz: one that rolls on gets a new one."""
-_SHEAR_SCALES: Final = (0.5, 3.0)
-"""Least and largest newtons of shear for a nominal one: 0.62 to 2.96 on 2000 drawn pads. An offset of x or y, as of a
-cable, must not be taken for more."""
 _SHEAR_PRIOR_N2: Final = 5.0
 """Sum of squared shear, in [N^2], by which a sensor's contacts outweigh the nominal counts per newton of x and y."""
 
@@ -95,9 +90,10 @@ class Balance:
         if tap != self._tap:
             self._tap, self._level = tap, (0.0,) * 4
         # Least squares over the contact, whose strong scans count most: of the network's z force, and of what pressing
-        # adds to x and y, over the sum of z.
+        # adds to x and y, over the sum of z. Scans fade over 200, two seconds at 100 Hz: a contact that rolls on gets a
+        # new level.
         pressed_x, pressed_y = (z * (self._pressing @ pattern.ravel())).tolist()
-        keep = 1 - 1 / _LEVEL_SCANS
+        keep = 1 - 1 / 200
         squares, by_force, by_x, by_y = self._level
         squares, by_force = keep * squares + z * z, keep * by_force + z * z_n
         by_x, by_y = keep * by_x + pressed_x, keep * by_y + pressed_y
@@ -109,7 +105,8 @@ class Balance:
         nominal += shear_x * shear_x + shear_y * shear_y
         found += shear_x * x_n + shear_y * y_n
         self._shear = nominal, found
-        scale = min(max(found / nominal, _SHEAR_SCALES[0]), _SHEAR_SCALES[1])
+        # Newtons for a nominal one, 0.62 to 2.96 on 2000 drawn pads: an offset of x or y, as of a cable, is no more.
+        scale = min(max(found / nominal, 0.5), 3.0)
         # Shear that the network has not found, or too much of it, lies where the pad is pressed.
         more_x, more_y = (scale * shear_x - x_n) / z_n, (scale * shear_y - y_n) / z_n
         mixed = np.array([(1, 0, more_x), (0, 1, more_y), (0, 0, z * by_force / squares / z_n)], dtype=np.float32)

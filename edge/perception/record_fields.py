@@ -17,8 +17,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.result import REASONS, NextTap, Result, Wrench, mask_bits
-from firmware_bridge.poses import PadPose
+from edge.perception.result import REASON_TEXTS, NextTap, Result, Wrench, mask_bits
+from firmware_bridge.poses import POSE_FIELDS, PadPose
 from firmware_bridge.scans.scan import Scan, VendorReading
 from firmware_bridge.zeroing.drift_tracker import Drift
 
@@ -163,6 +163,10 @@ def _text(characters: int, packed_bytes: int) -> Kind:
     return Kind("text", f"<U{characters}", f"{packed_bytes}s", "string")
 
 
+def _array(shape: str, unknown: float = math.nan) -> Kind:
+    return Kind("array", "<f4", unknown=unknown, shape=shape)
+
+
 def _one_of(*words: str, unknown: str | None = None) -> Kind:
     return Kind("text", f"<U{max(map(len, words))}", "i", "string", unknown, words)
 
@@ -175,15 +179,8 @@ _SMALL_OR_NOT: Final = Kind("integer", "<i2", "i", "int32", -1)
 _BITS: Final = Kind("integer", "<u8", "Q", "uint64")
 _YES_OR_NO: Final = Kind("boolean", "|i1", "i", "int8", -1)
 _IS_THERE: Final = Kind("boolean", "|b1", "i", "bool", False)
-_ID: Final = Kind("text", "<U16", unknown="")
 _TEXT: Final = Kind("text")
 _OBJECT: Final = Kind("object")
-_COUNTS: Final = Kind("array", "<i4", unknown=-1, shape="scan")
-_SCAN: Final = Kind("array", "<f4", unknown=math.nan, shape="scan")
-_PATTERN: Final = Kind("array", "<f4", unknown=0.0, shape="pattern")
-_DEVIATION: Final = Kind("array", "<f4", unknown=0.0, shape="deviation")
-_TRACTION: Final = Kind("array", "<f4", unknown=0.0, shape="traction")
-_POSES: Final = Kind("array", "<f4", unknown=math.nan, shape="poses")
 
 
 def _there(_: object) -> bool:
@@ -230,7 +227,7 @@ def _wrench(wrench: Wrench) -> dict[str, list[float] | None]:
 
 
 def _pose(pose: PadPose) -> dict[str, float]:
-    return dict(zip(_POSE_KEYS, _rounded(_pose_numbers(pose), 4), strict=True))
+    return dict(zip(POSE_FIELDS, _rounded(_pose_numbers(pose), 4), strict=True))
 
 
 def _next_tap(proposed: NextTap) -> dict[str, Any]:
@@ -245,17 +242,11 @@ def _poses(poses: NDArray[np.float32]) -> list[list[float]]:
 _RECORD_NPZ: Final = Out.RECORD | Out.NPZ
 _RECORD_ROS: Final = Out.RECORD | Out.ROS
 _NONE: Final = Out(0)
-_WRENCH_PARTS: Final = (
-    *("force_x_n", "force_y_n", "force_z_n"),
-    *("torque_x_n_mm", "torque_y_n_mm", "torque_z_n_mm"),
-)
-_POSE_KEYS: Final = ("x_mm", "y_mm", "turn_deg", "error_mm", "error_deg")
-_pose_numbers: Final = attrgetter(*_POSE_KEYS)
-_POSE_PARTS: Final = tuple(f"pose_{key}" for key in _POSE_KEYS)
+_pose_numbers: Final = attrgetter(*POSE_FIELDS)
+_POSE_PARTS: Final = tuple(f"pose_{key}" for key in POSE_FIELDS)
 _NEXT_TAP_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg")
 _next_tap_numbers: Final = attrgetter(*_NEXT_TAP_KEYS)
 _NEXT_TAP_PARTS: Final = tuple(f"next_tap_{key}" for key in _NEXT_TAP_KEYS)
-_CENTRE_PARTS: Final = ("centre_of_pressure_x_mm", "centre_of_pressure_y_mm")
 
 # fmt: off
 FIELDS: Final = (
@@ -305,10 +296,12 @@ FIELDS: Final = (
           make=_next_tap_numbers, parts=_NEXT_TAP_PARTS, json=_next_tap),
     Field("wrench", _REAL, "wrench", "force x, y, z on the pad in N, torque about x, y, z in N mm: see "
           "[Wrench](formats.md#wrench)",
-          make=lambda wrench: wrench.force_n + wrench.torque_n_mm, parts=_WRENCH_PARTS, json=_wrench, out=_RECORD_NPZ,
-          byte=512),
+          make=lambda wrench: wrench.force_n + wrench.torque_n_mm,
+          parts=("force_x_n", "force_y_n", "force_z_n", "torque_x_n_mm", "torque_y_n_mm", "torque_z_n_mm"),
+          json=_wrench, out=_RECORD_NPZ, byte=512),
     Field("centre_of_pressure_mm", _REAL, "wrench", "from the pad's centre, x right, y down; in records part of "
-          "`wrench`", make=attrgetter("centre_of_pressure_mm"), parts=_CENTRE_PARTS, out=Out.NPZ, byte=560),
+          "`wrench`", make=attrgetter("centre_of_pressure_mm"),
+          parts=("centre_of_pressure_x_mm", "centre_of_pressure_y_mm"), out=Out.NPZ, byte=560),
     Field("wrench_origin", _one_of("nominal", "calibrated", unknown=""), "wrench_origin",
           "whether newtons are this sensor's own: see [Wrench](formats.md#wrench)", out=_RECORD_NPZ, byte=504),
     Field("shear_ratio", _REAL, "wrench", "tangential over normal force: an object slips where it reaches the "
@@ -318,7 +311,7 @@ FIELDS: Final = (
     Field("trusted", _YES_OR_NO, "trusted", "whether the pattern is to be believed: see [Trust](trust.md); unknown for "
           "a contact that is too light to check, and for models without checks", byte=592),
     # Four bytes after it are free: an earlier release had a further word there.
-    Field("untrusted_reason", replace(_one_of(*REASONS, unknown=""), packed="i4x"), "untrusted_reason",
+    Field("untrusted_reason", replace(_one_of(*REASON_TEXTS, unknown=""), packed="i4x"), "untrusted_reason",
           "why not: see [the reasons](trust.md#the-reasons)", byte=596),
     Field("taps_dropped", _SMALL_OR_NOT, "taps_dropped", "earlier taps that the pattern is made "
           "without, because they do not belong to this contact; unknown without earlier taps",
@@ -332,14 +325,15 @@ FIELDS: Final = (
           out=_RECORD_ROS),
     Field("scan_pose", _REAL, "pose", "in records `pose`: x, y in mm, turn in degrees, and their standard deviations",
           make=_pose_numbers, parts=_POSE_PARTS, out=Out.NPZ),
-    Field("poses", _POSES, "poses", "of each tap that the pattern is made from, newest first, its pad's pose as the "
-          "newest tap's pad sees it: dx, dy in mm, turn in degrees, and their standard deviations; unknown for models "
-          "that take no poses", json=_poses, out=_RECORD_NPZ),
+    Field("poses", _array("poses"), "poses", "of each tap that the pattern is made from, newest first, its pad's "
+          "pose as the newest tap's pad sees it: dx, dy in mm, turn in degrees, and their standard deviations; unknown "
+          "for models that take no poses", json=_poses, out=_RECORD_NPZ),
     Field("run_time_us", _REAL, "run_time_us", "time of the inference, of all sensors in one call; unknown where the "
           "pattern was there already", decimals=1, byte=168),
     Field("latency_us", _REAL, "latency_us", "from the read that gave the scan's last byte to the pattern",
           decimals=1, byte=176),
-    Field("baseline", _ID, "baseline", "id of the baseline", make=attrgetter("id"), out=_RECORD_NPZ),
+    Field("baseline", Kind("text", "<U16", unknown=""), "baseline", "id of the baseline", make=attrgetter("id"),
+          out=_RECORD_NPZ),
     Field("baseline_origin", _TEXT, "baseline", "`start-up`, `file` or `demand`; or from the "
           "recording that is played: `recording`, where its pad is free, and `unsure`, where it may hold something all "
           "the time", make=attrgetter("origin"),
@@ -372,19 +366,20 @@ FIELDS: Final = (
     Field("temperature_k", _REAL, "scan.vendor", "mean of the sensor's thermometers by the vendor's server; no such "
           "key without", make=_temperature, decimals=2, out=Out.RECORD, left_out=True),
     Field("pattern_unit", _TEXT, "pattern_unit", "unit of the pattern and its deviation", out=Out.RECORD),
-    Field("zeroed", _SCAN, "zeroed", "counts over the baseline", out=_NONE, byte=PLACE_IN_HEADER),
-    Field("counts", _COUNTS, "scan", "raw counts x, y, z, so that everything can be computed again; null in records, "
-          "else -1, where a taxel gave no reading", make=attrgetter("counts"), json=_readings, out=_RECORD_NPZ,
+    Field("zeroed", _array("scan"), "zeroed", "counts over the baseline", out=_NONE, byte=PLACE_IN_HEADER),
+    Field("counts", Kind("array", "<i4", unknown=-1, shape="scan"), "scan", "raw counts x, y, z, so that everything "
+          "can be computed again; null in records, else -1, where a taxel gave no reading",
+          make=attrgetter("counts"), json=_readings, out=_RECORD_NPZ,
           byte=PLACE_IN_HEADER),
-    Field("pattern", _PATTERN, "pattern", "surface deformation, in `pattern_unit`", decimals=7,
+    Field("pattern", _array("pattern", 0.0), "pattern", "surface deformation, in `pattern_unit`", decimals=7,
           out=Out.NPZ | Out.MAP, byte=PLACE_IN_HEADER),
-    Field("deviation", _DEVIATION, "deviation", "standard deviation of each pixel of the pattern, where the model "
-          "gives it", decimals=7, out=Out.NPZ | Out.MAP, byte=PLACE_IN_HEADER),
-    Field("traction", _TRACTION, "traction", "force on the pad per area along x, y and z, in kPa, z into the pad, over "
-          "the same face as the pattern, where the model gives it", decimals=4, out=Out.NPZ | Out.MAP,
-          byte=PLACE_IN_HEADER),
-    Field("baseline_counts", _SCAN, "baseline", "what was subtracted, drift and all; NaN also where a taxel was not "
-          "zeroed", make=attrgetter("counts"), out=Out.NPZ),
+    Field("deviation", _array("deviation", 0.0), "deviation", "standard deviation of each pixel of the pattern, "
+          "where the model gives it", decimals=7, out=Out.NPZ | Out.MAP, byte=PLACE_IN_HEADER),
+    Field("traction", _array("traction", 0.0), "traction", "force on the pad per area along x, y and z, in kPa, z "
+          "into the pad, over the same face as the pattern, where the model gives it", decimals=4,
+          out=Out.NPZ | Out.MAP, byte=PLACE_IN_HEADER),
+    Field("baseline_counts", _array("scan"), "baseline", "what was subtracted, drift and all; NaN also where a "
+          "taxel was not zeroed", make=attrgetter("counts"), out=Out.NPZ),
 )
 # fmt: on
 """Every field of a result, in the order of the outputs but for shared memory, whose order is that of the bytes."""

@@ -1,12 +1,13 @@
-"""Result of the runtime for one scan, and its draft, which the stages of a sensor fill in turn.
+"""Result of the runtime for one scan, its draft, and the last pattern, which a draft may take instead of a new one.
 
-The draft is frozen once, at the end.
+The stages of a sensor fill the draft in turn; it is frozen once, at the end.
 """
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -26,9 +27,6 @@ Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "b
 """Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
 its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the model expects a large
 error; it was trained on no press so deep or strong, or on no such pad; the baseline is in doubt."""
-REASONS: Final[tuple[Reason, ...]] = (
-    *("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"),
-)
 REASON_TEXTS: Final[dict[Reason, str]] = {
     "stuck": "a taxel repeats itself (stuck?)",
     "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
@@ -191,9 +189,6 @@ def _bits(taxels: bytes) -> int:
     return int.from_bytes(np.packbits(np.frombuffer(taxels, dtype=np.bool_), bitorder="little").tobytes(), "little")
 
 
-_NONE_DEAD: Final[Mapping[int, str]] = {}
-
-
 class Origin(NamedTuple):
     """Fields that all results of a run have in common."""
 
@@ -264,7 +259,7 @@ class Step:
     baseline: Baseline | None = None
     baseline_age_s: float | None = None
     drift: Drift | None = None
-    dead: Mapping[int, str] = _NONE_DEAD
+    dead: Mapping[int, str] = MappingProxyType({})
     gains_certainty: float | None = None
     scale_error: float | None = None
     notes: tuple[Note, ...] = ()
@@ -288,7 +283,7 @@ class Step:
                 self.notes = (*self.notes, waited_note(waited_ns))
         # What no stage has set is not in the dictionary, and has its default in the result.
         values: dict[str, Any] = dict(vars(self))
-        for name in _OF_STAGES:
+        for name in ("readings", "doubted", "due", "estimate", "_origin"):
             values.pop(name, None)
         due, made = self.due, self.estimate
         if made is not None:
@@ -302,4 +297,53 @@ class Step:
         return Result(**values, **self._origin._asdict())
 
 
-_OF_STAGES: Final = ("readings", "doubted", "due", "estimate", "_origin")
+NOISE_COUNTS: Final = 2.0  # standard deviation of a reading at rest: 1.7 to 2.6 in recordings
+_CHANGE_COUNTS: Final = math.sqrt(2) * NOISE_COUNTS  # the same of a change, since noise is in both scans
+MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
+"""Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
+
+
+class LastPattern:
+    """Estimate of a sensor's last pattern, and what it was made from; allocates no array after construction.
+
+    Attributes:
+        estimate: None before the first, and where it must not be used again.
+    """
+
+    def __init__(self, scan_shape: tuple[int, int, int], *, every_scan: bool = False) -> None:
+        """Begin without one; with `every_scan` none is used again."""
+        self._every_scan = every_scan
+        self.estimate: Estimate | None = None
+        self._scan_number = -1
+        self._counts = np.zeros(scan_shape, dtype=np.float32)
+        self._change = np.zeros(scan_shape, dtype=np.float32)
+        self._made_by: Hashable = None
+        self._poses: NDArray[np.float32] | None = None
+
+    def reuse(self, step: Step, due: Window) -> bool:
+        """Give a step the estimate if readings and poses have not changed beyond noise since; return whether it has it.
+
+        Nor must the maker have changed, which is what distinguishes the pattern from others.
+        """
+        if self._every_scan or self.estimate is None or due.made_by != self._made_by:
+            return False
+        poses = due.poses
+        if poses is not None and (
+            self._poses is None or poses.shape != self._poses.shape or (np.abs(poses - self._poses) > MOVED).any()
+        ):
+            return False
+        np.subtract(due.counts[0], self._counts, out=self._change)
+        np.abs(self._change, out=self._change)
+        # Noise reaches neither five of its deviations in one reading, nor 1.4 of them in the RMS of all.
+        if np.maximum.reduce(self._change, axis=None) > 5 * _CHANGE_COUNTS:
+            return False
+        if float(np.vdot(self._change, self._change)) > (1.4 * _CHANGE_COUNTS) ** 2 * self._change.size:
+            return False
+        step.estimate, step.reused_from = self.estimate, self._scan_number
+        return True
+
+    def keep(self, step: Step, due: Window, made: Estimate) -> None:
+        """Keep the estimate of a step's pattern."""
+        self.estimate, self._scan_number = made, step.scan.number
+        self._counts[...] = due.counts[0]
+        self._poses, self._made_by = due.poses, due.made_by

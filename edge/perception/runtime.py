@@ -19,9 +19,9 @@ from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.event import OLD_NS, UNCHECKED, EventKind, Untimed, age_notes, notes_on_missing
 from edge.perception.gain_learning import ContactModel, Learn
 from edge.perception.pattern_description import Describe
-from edge.perception.result import Estimate, Origin, Result, Step, Window
+from edge.perception.result import Estimate, LastPattern, Origin, Result, Step, Window
 from edge.perception.tap_tracker import TapTracker
-from edge.perception.taps import LastPattern, Taps
+from edge.perception.taps import Taps
 from edge.perception.taxel_health import Health, TaxelEstimator
 from edge.perception.trust_check import Check, PatternCheck, SensorPad
 from edge.perception.zeroing import BaselineDoubt, Zeroing

@@ -1,8 +1,7 @@
-"""Stage that follows the taps of one sensor: the window of a due pattern, its poses, where to touch next, and reuse."""
+"""Stage that follows the taps of one sensor: the window of a due pattern, its poses, and where to touch next."""
 
-import math
-from collections.abc import Callable, Hashable, Sequence
-from math import hypot, radians, sqrt
+from collections.abc import Callable, Sequence
+from math import cos, hypot, radians, sin, sqrt
 from typing import Final
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract, pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import EventKind, Report
-from edge.perception.result import Estimate, NextTap, Step, Window
+from edge.perception.result import NextTap, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import Health
 from edge.perception.trust_check import REPEATS
@@ -154,8 +153,8 @@ def next_shift_mm(places_mm: NDArray[np.floating], reach_mm: float) -> tuple[flo
 
 def _reached(newest: PadPose, dx_mm: float, dy_mm: float) -> PadPose:
     """Return the pose in the object's plane of a shift in the newest tap's axes."""
-    turn = math.radians(newest.turn_deg)
-    cosine, sine = math.cos(turn), math.sin(turn)
+    turn = radians(newest.turn_deg)
+    cosine, sine = cos(turn), sin(turn)
     return PadPose(
         newest.x_mm + cosine * dx_mm - sine * dy_mm,
         newest.y_mm + sine * dx_mm + cosine * dy_mm,
@@ -219,55 +218,3 @@ class Taps:
             counts = tap.window[list(slots)]
         made_by = (tap.tap, tuple(slots), taps, step.filled, self._health.most_repeats >= REPEATS)
         return Window(counts, taps, slots, rows, tap.tap, made_by)
-
-
-NOISE_COUNTS: Final = 2.0  # standard deviation of a reading at rest: 1.7 to 2.6 in recordings
-_CHANGE_COUNTS: Final = math.sqrt(2) * NOISE_COUNTS  # the same of a change, since noise is in both scans
-MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
-"""Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
-
-
-class LastPattern:
-    """Estimate of a sensor's last pattern, and what it was made from; allocates no array after construction.
-
-    Attributes:
-        estimate: None before the first, and where it must not be used again.
-    """
-
-    def __init__(self, scan_shape: tuple[int, int, int], *, every_scan: bool = False) -> None:
-        """Begin without one; with `every_scan` none is used again."""
-        self._every_scan = every_scan
-        self.estimate: Estimate | None = None
-        self._scan_number = -1
-        self._counts = np.zeros(scan_shape, dtype=np.float32)
-        self._change = np.zeros(scan_shape, dtype=np.float32)
-        self._made_by: Hashable = None
-        self._poses: NDArray[np.float32] | None = None
-
-    def reuse(self, step: Step, due: Window) -> bool:
-        """Give a step the estimate if readings and poses have not changed beyond noise since; return whether it has it.
-
-        Nor must the maker have changed, which is what distinguishes the pattern from others.
-        """
-        if self._every_scan or self.estimate is None or due.made_by != self._made_by:
-            return False
-        poses = due.poses
-        if poses is not None and (
-            self._poses is None or poses.shape != self._poses.shape or (np.abs(poses - self._poses) > MOVED).any()
-        ):
-            return False
-        np.subtract(due.counts[0], self._counts, out=self._change)
-        np.abs(self._change, out=self._change)
-        # Noise reaches neither five of its deviations in one reading, nor 1.4 of them in the RMS of all.
-        if np.maximum.reduce(self._change, axis=None) > 5 * _CHANGE_COUNTS:
-            return False
-        if float(np.vdot(self._change, self._change)) > (1.4 * _CHANGE_COUNTS) ** 2 * self._change.size:
-            return False
-        step.estimate, step.reused_from = self.estimate, self._scan_number
-        return True
-
-    def keep(self, step: Step, due: Window, made: Estimate) -> None:
-        """Keep the estimate of a step's pattern."""
-        self.estimate, self._scan_number = made, step.scan.number
-        self._counts[...] = due.counts[0]
-        self._poses, self._made_by = due.poses, due.made_by

@@ -50,11 +50,10 @@ LONE_SHARE: Final = 0.015
 """Share of the largest taxel's reading that the second largest reaches in any contact: at least 0.030 with a small
 sphere on one taxel alone, 0.063 on simulated taps, 0.67 on real grips."""
 REST_COUNTS: Final = 500.0  # reading below which a taxel that was far from rest is believed again
-REACH_COUNTS: Final = ((-2800.0, 2800.0), (-2800.0, 2800.0), (-2800.0, 27000.0))
-"""Limits of x, y, z: twice what sensors in the field have shown, whose z only rises when pressed."""
 REASONS: Final = ("silent", "saturated", "stuck", "far", "unzeroed")
 SILENT, SATURATED, STUCK, FAR, UNZEROED = range(1, 6)
-_LOW, _HIGH = np.array(REACH_COUNTS, dtype=np.float32).T[:, :, None, None]
+# Limits of x, y and z: twice what sensors in the field have shown, whose z only rises when pressed.
+_LOW, _HIGH = np.array([(-2800, 2800), (-2800, 2800), (-2800, 27000)], dtype=np.float32).T[:, :, None, None]
 _WORDS: Final = {
     "silent": "silent",
     "saturated": "at the end of its range",

@@ -36,8 +36,6 @@ With the others 3.5 % of simulated contacts less than 30 % off are not believed,
 REPEATS: Final = 5
 """Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
 longer than 3."""
-SAME_STRENGTH: Final = 0.85
-"""Strength of a press, over that of an earlier tap, from which the two are compared for good."""
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
 
 
@@ -54,7 +52,7 @@ class PatternCheck:
 
     def __init__(self, trust: Trust, contract: Contract) -> None:
         self._trust = trust
-        self._constants = len(contract.pad_inputs)
+        self._constants, self._takes_gains = len(contract.pad_inputs), contract.takes_gains
         self._unit_counts = contract.counts_per_unit[2]
         self._deepest = 1.1 * contract.output_full_scale  # a little more than the deepest press in training
         self.use_pad(np.zeros(contract.pad_width, dtype=np.float32))
@@ -71,7 +69,7 @@ class PatternCheck:
         """Check from now on with a pad as model input, maybe far outside those of the training; the evidence stays."""
         self._pad_row, self._outside = pad_row, outside
         self._operator = self._trust.forward.of_pad(pad_row[: self._constants])
-        certainty = float(pad_row[-1]) if len(pad_row) > 2 * self._constants else 0.0
+        certainty = float(pad_row[-1]) if self._takes_gains else 0.0
         self._gain_error = GAIN_SPREAD * (1 - certainty)
 
     def belonging(
@@ -134,6 +132,8 @@ class PatternCheck:
         """Add the evidence of each contact once, by its strongest scan, when the next one begins."""
         if tap != self._tap:
             if self._tap is not None:
+                # A doubtful contact, up to 1.5, speaks for the sensor; none counts for more than 4.5 either way. So
+                # three clear faults in a row pass 12, and two to four good contacts lead from 12 to 20 below 6.
                 step = min(max(self._score - 1.5, -4.5), 4.5)
                 self._evidence = min(max(self._evidence + step, 0.0), 20.0)
                 self.suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
@@ -170,7 +170,7 @@ def most_doubt(z_counts: float) -> float:
 def _share(log_odds: float) -> float:
     if math.isnan(log_odds):
         return 1.0
-    return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))
+    return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))  # beyond 30 it is 0 or 1 to ten digits
 
 
 class Check:
@@ -184,8 +184,8 @@ class Check:
     ) -> tuple[list[int], tuple[float, ...] | None]:
         """Return the numbers of the taps of a window that belong to the contact, and the mismatch of each earlier one.
 
-        A press as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have begun.
-        `scaled` is the window in network units, (K, 3, rows, cols).
+        A press nearly as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have
+        begun. `scaled` is the window in network units, (K, 3, rows, cols).
         """
         every = list(range(window.taps))
         if self._check is None:
@@ -196,7 +196,7 @@ class Check:
         settled = [
             number
             for number in (dropped if posed else dropped[:1])
-            if scaled[0, 2].sum() >= SAME_STRENGTH * scaled[number, 2].sum()
+            if scaled[0, 2].sum() >= 0.85 * scaled[number, 2].sum()
         ]
         for number in settled:
             self._report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")

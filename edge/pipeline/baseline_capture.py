@@ -13,8 +13,7 @@ from firmware_bridge.errors import BaselineRefusedError, DeviceError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import GIVEN_UP_S, POLL_S
-from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
-from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
+from firmware_bridge.zeroing.baseline import FEWEST_RECORDED, FEWEST_SCANS, Baseline, BaselineEstimator
 
 
 def take_baselines(

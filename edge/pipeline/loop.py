@@ -15,7 +15,7 @@ from edge.perception.runtime import Runtime
 from edge.pipeline.cadence import Cadences
 from edge.pipeline.commands import Commands
 from edge.pipeline.pose_queue import PoseIntake
-from edge.pipeline.run_statistics import COUNTED, Statistics
+from edge.pipeline.run_statistics import Statistics, counts_of
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.validation import check_positive
@@ -29,10 +29,8 @@ if TYPE_CHECKING:
     from edge.pipeline.gain_keeper import GainKeeper
 
 _UNWRITTEN: Final = attrgetter("unwritten")
-_TROUBLES: Final = attrgetter(*COUNTED)
 LinkState = Literal["up", "silent", "lost", "ended"]
 ALL_HEARD_SCANS: Final = 10  # scans of one sensor of a link after which all sensors of that link have sent some
-COUNTED_NS: Final = 250_000_000  # age of the counters of a record, at most, while all is well, in [ns] of scan time
 
 
 class Loop:
@@ -288,9 +286,11 @@ class Loop:
             self._tell(back)
         self._tally()
         if self._sinks:
-            # Counters are read where they are due, and where something was lost: merging them took a tenth of a scan.
-            scan, troubles = result.scan, _TROUBLES(self.statistics)
-            if not (0 <= scan.time_ns - self._counted_ns < COUNTED_NS and scan.whole and troubles == self._troubles):
+            # Counters are read where something was lost, else four times a second by the time of the scans: merging
+            # them took a tenth of a scan.
+            scan, troubles = result.scan, counts_of(self.statistics)
+            fresh = 0 <= scan.time_ns - self._counted_ns < 250_000_000
+            if not (fresh and scan.whole and troubles == self._troubles):
                 self._counted_ns, self._troubles = scan.time_ns, troubles
                 self._counters = self._source.counters() | self.statistics.counters()
             for sink in self._sinks:

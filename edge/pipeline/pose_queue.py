@@ -13,7 +13,7 @@ from edge.perception.runtime import Runtime
 from edge.validation import as_float
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose, TimedPose
 from firmware_bridge.scans.scan import is_sensor_name
-from firmware_bridge.schedule import POSES_SILENT_NS
+from firmware_bridge.schedule import SENSOR_SILENT_NS
 
 FURTHEST_AHEAD_NS: Final = 1_000_000_000
 """Longest time that a pose may lie ahead of now, in [ns]: all others until then would come too late."""
@@ -221,7 +221,7 @@ class PoseIntake:
         """Return events: of poses that stopped or came back since the last call, and of poses that are refused."""
         for sensor, course in self._courses.items():
             away_ns = now_ns - course.last_ns
-            if not (course.silent or course.holds) and away_ns > POSES_SILENT_NS:
+            if not (course.silent or course.holds) and away_ns > SENSOR_SILENT_NS:
                 course.silent = True
                 text = (
                     f"no pose{_of(sensor)} for {away_ns / 1e9:.1f} s, so patterns are of one tap: check what sends "

@@ -20,7 +20,7 @@ COUNTED: Final = (
     *("poses", "poses_refused", "poses_dropped", "unwritten"),
 )
 """Counts of which records have counters."""
-_COUNTS: Final = attrgetter(*COUNTED)
+counts_of: Final = attrgetter(*COUNTED)  # function from statistics to these counts
 
 
 class Histogram:
@@ -92,7 +92,7 @@ class Statistics:
 
     def counters(self) -> dict[str, int]:
         """Return the counts of which records have counters."""
-        return dict(zip(COUNTED, _COUNTS(self), strict=True))
+        return dict(zip(COUNTED, counts_of(self), strict=True))
 
     def add(self, result: Result) -> None:
         """Count one result."""

@@ -27,14 +27,8 @@ from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.csv_reader import CSV_POSES, EMULATED, csv_header
 from firmware_bridge.recording.mcap_records import DamageError, messages
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
-from firmware_bridge.recording.scan_messages import (
-    BASELINE_NAME,
-    SCAN_NAME,
-    decode_baseline,
-    decode_scan,
-    mounting_text,
-)
-from firmware_bridge.recording.tracks import Track
+from firmware_bridge.recording.scan_messages import BASELINE_NAME, SCAN_NAME, decode_baseline, decode_scan
+from firmware_bridge.recording.tracks import Track, mounting_text
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.schedule import NS_PER_S

@@ -50,10 +50,9 @@ from firmware_bridge.recording.scan_messages import (
     encode_baseline,
     encode_pose,
     encode_scan,
-    mounting_text,
     scan_type,
 )
-from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA
+from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA, mounting_text
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.sensor_file.model import SensorFile

@@ -15,7 +15,6 @@ from edge.perception.result import Result
 from edge.pipeline.commands import Commands
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.sinks.ros2.messages import base_topic
 from firmware_bridge.errors import as_typed, how_to_install
 from firmware_bridge.poses import TimedPose
 
@@ -228,6 +227,8 @@ def _check_rerun(target: str) -> None:
 
 def _ros2_topic(target: str) -> tuple[str, bool]:
     """Return the topic of a target, and whether commands are accepted."""
+    from edge.sinks.ros2.messages import base_topic  # no other sink needs the messages of ROS
+
     topic, asked, option = target.partition("?")
     if asked and option != "commands":
         raise UsageError(f"ros2:{target} has {option!r} after its topic, expected ros2:TOPIC or ros2:TOPIC?commands")

@@ -64,7 +64,7 @@ class StatusSink(Sink):
 
     def _refresh(self) -> None:
         now_s = self._clock_s()
-        if self._terminal and (self._last_shown_s is None or now_s - self._last_shown_s >= 0.1):
+        if self._terminal and (self._last_shown_s is None or now_s - self._last_shown_s >= SHOWN_AT_REST_S):
             self._last_shown_s = now_s
             self._show()
 

@@ -76,13 +76,13 @@ def serial_ports() -> list[Port]:
     return sorted(ports)
 
 
-def latency_timer_ms(port: str, root: Path = LATENCY_ROOT) -> int | None:
+def latency_timer_ms(port: str) -> int | None:
     """Return the time for which the driver of a port lets bytes wait, in [ms]; None where it is not shown.
 
     Source: Linux, drivers/usb/serial/ftdi_sio.c, latency_timer_show; 1 is shown while low latency was asked for.
     """
     try:
-        text = (root / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii").strip()
+        text = (LATENCY_ROOT / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii").strip()
     except (OSError, ValueError):
         return None
     return int(text) if text.isdigit() else None

@@ -40,12 +40,9 @@ MOST_CSV_BYTES: Final = 1 << 30  # most bytes of a CSV: some eight hours of one 
 LONGEST_CSV_LINE: Final = 1 << 14  # most characters of a line: fifty times a row of counts
 
 
-def csv_header(taxel_count: int) -> tuple[str, ...]:
-    """Return the columns of so many taxels."""
+def csv_header(taxel_count: int = USPA44.taxel_count) -> tuple[str, ...]:
+    """Return the columns of so many taxels, by default those of a uSPa44."""
     return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
-
-
-CSV_HEADER: Final = csv_header(USPA44.taxel_count)
 
 
 def _rate_of(name: str, times: ArrayLike) -> float | None:

@@ -27,7 +27,6 @@ from firmware_bridge.recording.scan_messages import (
     decode_baseline,
     decode_pose,
     decode_scan,
-    read_mounting,
     scan_type,
 )
 from firmware_bridge.recording.tracks import (
@@ -39,6 +38,7 @@ from firmware_bridge.recording.tracks import (
     Recording,
     Track,
     origin_of,
+    read_mounting,
 )
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import VendorReading, is_sensor_name

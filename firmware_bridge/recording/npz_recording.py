@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import CdrError, NpzError, RecordingError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
 from firmware_bridge.poses import POSE_FIELDS, TimedPose
-from firmware_bridge.recording.scan_messages import checked_pose, read_mounting
 from firmware_bridge.recording.tracks import (
     A_RATE,
     HIGHEST_COUNT,
@@ -31,8 +30,10 @@ from firmware_bridge.recording.tracks import (
     MOST_SENSORS,
     Recording,
     Track,
+    checked_pose,
     is_rate,
     origin_of,
+    read_mounting,
 )
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name

@@ -3,8 +3,6 @@
 Decoders raise a CdrError for bytes that are no such message, and for a value that is impossible.
 """
 
-import json
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from dataclasses import fields as dataclass_fields
 from functools import lru_cache
@@ -13,15 +11,13 @@ from typing import Any, Final, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.errors import CdrError
 from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
-from firmware_bridge.poses import POSE_FIELDS, PadPose, TimedPose
+from firmware_bridge.poses import POSE_FIELDS, TimedPose
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
-from firmware_bridge.recording.tracks import HIGHEST_COUNT
-from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.recording.tracks import HIGHEST_COUNT, check, check_times, checked_pose
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS, HIGHEST_UPS_HZ, KELVIN
-from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
+from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline, Origin
 
 SCAN_NAME: Final = "tactile_edge_sr/msg/Scan"
@@ -128,16 +124,16 @@ def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> 
     """Decode the scan in a message."""
     fields = scan_type(geometry.taxel_count).decode(data)
     sensor, fresh, renewed = fields["sensor"], fields["fresh"], fields["renewed"]
-    _check(is_sensor_name(sensor), "sensor", sensor, "a name")
-    _check_times(fields, number=0, time_ns=0, device_time_ns=-1)
+    check(is_sensor_name(sensor), "sensor", sensor, "a name")
+    check_times(fields, number=0, time_ns=0, device_time_ns=-1)
     right = fresh < 1 << geometry.taxel_count and renewed & ~fresh == 0
-    _check(right, "fresh and renewed", (fresh, renewed), "renewed taxels that are")
+    check(right, "fresh and renewed", (fresh, renewed), "renewed taxels that are")
     counts = fields["counts"].reshape(geometry.scan_shape)
     _check_range("counts", counts, ABSENT, HIGHEST_COUNT)
     taxels = np.unpackbits(np.frombuffer(fresh.to_bytes(8, "little"), np.uint8), bitorder="little")
     absent = ~taxels[: geometry.taxel_count].astype(bool).reshape(geometry.rows, geometry.cols)
     right = bool(((counts == ABSENT) == absent).all())
-    _check(right, "counts", "readings", "one on each axis of a fresh taxel, none of others")
+    check(right, "counts", "readings", "one on each axis of a fresh taxel, none of others")
     vendor: dict[str, NDArray[np.float32]] = {}
     for name, shape, low, high in (
         ("newtons", geometry.scan_shape, -HIGHEST_NEWTONS, HIGHEST_NEWTONS),
@@ -149,7 +145,7 @@ def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> 
         _check_range(f"vendor_{name}", array, low, high, or_none=name == "temperature_k")
         if array.size:
             right = array.size == int(np.prod(shape))
-            _check(right, f"vendor_{name}", f"{array.size} numbers", f"none, or {int(np.prod(shape))}")
+            check(right, f"vendor_{name}", f"{array.size} numbers", f"none, or {int(np.prod(shape))}")
             vendor[name] = array.reshape(shape).copy()  # a view would keep the whole chunk of a file in memory
     return RecordedScan(
         *(fields["header"]["frame_id"], sensor, fields["number"], fields["time_ns"], fields["device_time_ns"]),
@@ -178,15 +174,15 @@ def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44)
     """Decode the baseline in a message, with the origin that it had in the recorded run."""
     fields = baseline_type(geometry.taxel_count).decode(data)
     sensor, created_unix_s, scans = fields["sensor"], fields["created_unix_s"], fields["scans"]
-    _check(is_sensor_name(sensor), "sensor", sensor, "a name")
-    _check(is_sensor_name(fields["id"]), "id", fields["id"], "a short text")
+    check(is_sensor_name(sensor), "sensor", sensor, "a name")
+    check(is_sensor_name(fields["id"]), "id", fields["id"], "a short text")
     if np.isnan(created_unix_s):
         age_s, at = fields["age_s"], fields["header"]["stamp"]
-        _check(np.isnan(age_s) or 0 <= age_s <= LAST_UNIX_S, "age_s", age_s, f"0..{LAST_UNIX_S:g} seconds, or none")
+        check(np.isnan(age_s) or 0 <= age_s <= LAST_UNIX_S, "age_s", age_s, f"0..{LAST_UNIX_S:g} seconds, or none")
         created_unix_s = at["sec"] + at["nanosec"] / NS_PER_S - age_s
     else:
-        _check(0 < created_unix_s <= LAST_UNIX_S, "created_unix_s", created_unix_s, "seconds since 1970, or none")
-    _check(scans >= 1, "scans", scans, "a whole number from 1")
+        check(0 < created_unix_s <= LAST_UNIX_S, "created_unix_s", created_unix_s, "seconds since 1970, or none")
+    check(scans >= 1, "scans", scans, "a whole number from 1")
     counts = np.array(fields["counts"].reshape(geometry.scan_shape))
     _check_range("counts", counts, 0, HIGHEST_COUNT + 1, or_none=True)
     counts.setflags(write=False)
@@ -215,57 +211,12 @@ def decode_pose(data: bytes | memoryview) -> TimedPose:
     return checked_pose(numbers, *(fields[name] for name in ("time_ns", "holds", "used_from_ns", "sensor")))
 
 
-def checked_pose(numbers: Sequence[float], time_ns: int, holds: int, used_from_ns: int, sensor: str) -> TimedPose:
-    """Return the pose of these POSE_FIELDS, and of the other fields of POSE, as recordings hold them."""
-    _check(not sensor or is_sensor_name(sensor), "sensor", sensor, "a name, or none")
-    _check_times({"time_ns": time_ns, "used_from_ns": used_from_ns}, time_ns=0, used_from_ns=-1)
-    _check(holds <= 1, "holds", holds, "0 or 1")
-    try:
-        pose = PadPose(*numbers)
-    except ValueError as error:
-        raise CdrError(str(error)) from error
-    return TimedPose(pose, time_ns, sensor or None, bool(holds), None if used_from_ns < 0 else used_from_ns)
-
-
-def mounting_text(mounting: Mounting) -> str:
-    """Return a mounting as JSON, without its number of taxels, which the scans show."""
-    fields = asdict(mounting)
-    del fields["taxel_count"]
-    return json.dumps(fields)
-
-
-def read_mounting(text: str, taxel_count: int) -> Mounting:
-    """Return the mounting in a text of `mounting_text`.
-
-    Raises:
-        ValueError: it is none, or none of so many taxels.
-    """
-    try:
-        fields = json.loads(text)
-        order, signs, gains = (tuple(fields[key]) for key in ("order", "signs", "gains"))
-        if not all(type(value) is int for value in (*order, *signs)) or type(fields["swap_xy"]) is not bool:
-            raise ValueError("not whole numbers")
-        return Mounting(order, fields["swap_xy"], signs, tuple(map(float, gains)), taxel_count)
-    except (TypeError, KeyError, RecursionError, OverflowError) as error:
-        raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from error
-
-
 def _header(frame: str, unix_ns: int) -> dict[str, Any]:
     return {"stamp": stamp(unix_ns), "frame_id": frame}
-
-
-def _check_times(fields: Mapping[str, Any], **least: int) -> None:
-    for name, low in least.items():
-        _check(low <= fields[name] <= LAST_TIME_NS, name, fields[name], f"{low}..{LAST_TIME_NS}")
 
 
 def _check_range(name: str, array: NDArray[Any], low: float, high: float, *, or_none: bool = False) -> None:
     inside = (array >= low) & (array <= high)
     right = (inside | np.isnan(array)) if or_none else inside
     got = "others" if right.all() else f"{array[~right][0]:g}"
-    _check(bool(right.all()), name, got, f"{low:g}..{high:g}" + ", or none" * or_none)
-
-
-def _check(right: bool, name: str, got: object, expected: str) -> None:
-    if not right:
-        raise CdrError(f"{name}: {str(got)[:60]!r}, expected {expected}")
+    check(bool(right.all()), name, got, f"{low:g}..{high:g}" + ", or none" * or_none)

@@ -1,20 +1,22 @@
-"""Recordings in memory: tracks of scans, one per sensor."""
+"""Recordings in memory: tracks of scans, one per sensor; and what all formats have in common."""
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.errors import CdrError
 from firmware_bridge.pad_geometry import SensorGeometry, pad_of
-from firmware_bridge.scans.scan import VendorReading
-from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.poses import PadPose, TimedPose
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import VendorReading, is_sensor_name
+from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 
 if TYPE_CHECKING:
-    from firmware_bridge.poses import TimedPose
-    from firmware_bridge.scans.mounting import Mounting
     from firmware_bridge.zeroing.baseline import Baseline
 
 GEOMETRY_METADATA: Final = "geometry"  # name of the MCAP metadata that holds the pad of all sensors
@@ -82,11 +84,11 @@ class Recording:
     tracks: tuple[Track, ...]
     rate_hz: float | None
     baselines: "Mapping[str, Baseline]" = field(default_factory=dict)
-    mountings: "Mapping[str, Mounting]" = field(default_factory=dict)
+    mountings: Mapping[str, Mounting] = field(default_factory=dict)
     unix_offset_ns: int | None = None
     notes: tuple[str, ...] = ()
     origin: Literal["device", "emulated"] | None = None
-    poses: "Sequence[TimedPose]" = ()
+    poses: Sequence[TimedPose] = ()
     poses_by_row: bool = False
 
 
@@ -101,3 +103,50 @@ def origin_of(kinds: Iterable[str | None]) -> Literal["device", "emulated"] | No
 def is_rate(rate_hz: float) -> bool:
     """Return True if scans can come at this rate in [Hz]."""
     return RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
+
+
+def checked_pose(numbers: Sequence[float], time_ns: int, holds: int, used_from_ns: int, sensor: str) -> TimedPose:
+    """Return the pose of these POSE_FIELDS, and of the other fields of a pose's message, as recordings hold them."""
+    check(not sensor or is_sensor_name(sensor), "sensor", sensor, "a name, or none")
+    check_times({"time_ns": time_ns, "used_from_ns": used_from_ns}, time_ns=0, used_from_ns=-1)
+    check(holds <= 1, "holds", holds, "0 or 1")
+    try:
+        pose = PadPose(*numbers)
+    except ValueError as error:
+        raise CdrError(str(error)) from error
+    return TimedPose(pose, time_ns, sensor or None, bool(holds), None if used_from_ns < 0 else used_from_ns)
+
+
+def mounting_text(mounting: Mounting) -> str:
+    """Return a mounting as JSON, without its number of taxels, which the scans show."""
+    fields = asdict(mounting)
+    del fields["taxel_count"]
+    return json.dumps(fields)
+
+
+def read_mounting(text: str, taxel_count: int) -> Mounting:
+    """Return the mounting in a text of `mounting_text`.
+
+    Raises:
+        ValueError: it is none, or none of so many taxels.
+    """
+    try:
+        fields = json.loads(text)
+        order, signs, gains = (tuple(fields[key]) for key in ("order", "signs", "gains"))
+        if not all(type(value) is int for value in (*order, *signs)) or type(fields["swap_xy"]) is not bool:
+            raise ValueError("not whole numbers")
+        return Mounting(order, fields["swap_xy"], signs, tuple(map(float, gains)), taxel_count)
+    except (TypeError, KeyError, RecursionError, OverflowError) as error:
+        raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from error
+
+
+def check_times(fields: Mapping[str, Any], **least: int) -> None:
+    """Check that numbers and times of a recording are in range; `least` has the lowest valid one of each by name."""
+    for name, low in least.items():
+        check(low <= fields[name] <= LAST_TIME_NS, name, fields[name], f"{low}..{LAST_TIME_NS}")
+
+
+def check(right: bool, name: str, got: object, expected: str) -> None:
+    """Raise a CdrError unless a value of a recording, called `name`, is `right`."""
+    if not right:
+        raise CdrError(f"{name}: {str(got)[:60]!r}, expected {expected}")

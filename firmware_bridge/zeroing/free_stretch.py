@@ -1,17 +1,21 @@
 """Search of a recording for the scans during which its pad is free and still."""
 
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.scans.scan import ABSENT
-from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, refuse_load, refuse_motion, unwrapped
-
-FEWEST_RECORDED: Final = 30
-"""Scans for a baseline of a recording, which cannot be extended: a pad may be free for only half a second there."""
+from firmware_bridge.zeroing.baseline import (
+    FEWEST_RECORDED,
+    FEWEST_SCANS,
+    Baseline,
+    refuse_load,
+    refuse_motion,
+    unwrapped,
+)
 
 
 class Stretch(NamedTuple):

@@ -9,12 +9,12 @@ from hostile_samples import one_line
 
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.recording.csv_reader import CSV_HEADER
+from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED, free_stretch
 
-HEADER = ",".join(CSV_HEADER) + "\n"
+HEADER = ",".join(csv_header()) + "\n"
 
 
 def row(number: int) -> str:

@@ -16,7 +16,7 @@ from edge.api import Statistics, open_source
 from edge.cli import main as cli
 from edge.inference.bundled import demo_recording, find_model
 from edge.inference.contract import KEY_PREFIX, Contract
-from edge.perception.result import REASONS
+from edge.perception.result import REASON_TEXTS
 from edge.sinks.json_records import CHOICES, PROGRESS
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.mounting import Mounting
@@ -90,7 +90,7 @@ def test_keys_of_the_contract_and_of_datasets():
 def test_each_reason_and_each_field_of_trust_is_on_its_page():
     page = (ROOT / "docs" / "trust.md").read_text()
     explained = re.findall(r"^\| `(\w+)` \|", page.split("## The reasons", 1)[1].split("##", 1)[0], re.MULTILINE)
-    assert sorted(explained) == sorted(REASONS)
+    assert sorted(explained) == sorted(REASON_TEXTS)
     for field in ("trusted", "untrusted_reason", "mismatch", "tap_mismatch", "taps_dropped"):
         assert field in told("Records") and f"`{field}`" in page
 

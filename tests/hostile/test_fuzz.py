@@ -28,7 +28,7 @@ from edge.inference.onnx_guard import check_plain
 from edge.inference.onnx_session import ModelSession
 from edge.pipeline.commands import CommandLines, Commands
 from firmware_bridge.errors import RecordingError, SensorFileError
-from firmware_bridge.recording.csv_reader import CSV_HEADER
+from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import baseline_type, encode_baseline, encode_scan, scan_type
 from firmware_bridge.recording.tracks import HIGHEST_COUNT
@@ -179,7 +179,7 @@ def npy_in_npz(data: bytes) -> None:
 
 
 def csv_seeds() -> list[bytes]:
-    header, values = ",".join(CSV_HEADER), REST.reshape(3, 16).T.ravel()
+    header, values = ",".join(csv_header()), REST.reshape(3, 16).T.ravel()
     row, quoted = ",".join(f"{value}.0" for value in values), ",".join(f'"{value}"' for value in values)
     other = f"sep=;\ntime;{header}\n0;{row}".replace(",", ";").encode("utf-16")
     return [f"{header}\n{row}\n".encode(), f"\ufeff{header}\r\n{row}\r\n{quoted}\r\n".encode(), other]

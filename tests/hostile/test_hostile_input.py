@@ -22,7 +22,7 @@ from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.in_place import read_bounded
 from firmware_bridge.recording import csv_reader
 from firmware_bridge.recording import npz_recording as recording
-from firmware_bridge.recording.csv_reader import CSV_HEADER
+from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.npz_recording import read_npz
 from firmware_bridge.zeroing.baseline import load_baselines
@@ -129,7 +129,7 @@ def test_of_an_archive_what_is_asked_for_alone_is_read(tmp_path):
 def test_a_csv_line_without_end(tmp_path, bounded_memory):
     path = tmp_path / "finger.csv"
     with path.open("wb") as file:
-        file.write((",".join(CSV_HEADER) + "\n").encode())
+        file.write((",".join(csv_header()) + "\n").encode())
         file.truncate(1 << 32)
     with pytest.raises(RecordingError, match="line 2: a line longer than 16384 bytes"):
         load_recording(path)
@@ -138,7 +138,7 @@ def test_a_csv_line_without_end(tmp_path, bounded_memory):
 def test_a_csv_file_larger_than_is_read(tmp_path, limits):
     limits(csv_reader, MOST_CSV_BYTES=1000)
     path = tmp_path / "finger.csv"
-    path.write_text(",".join(CSV_HEADER) + "\n" + (",".join(["1"] * 48) + "\n") * 10)
+    path.write_text(",".join(csv_header()) + "\n" + (",".join(["1"] * 48) + "\n") * 10)
     with pytest.raises(RecordingError, match=r"larger than 1,000 bytes, expected a smaller one"):
         load_recording(path)
 

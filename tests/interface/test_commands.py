@@ -16,8 +16,7 @@ import pytest
 from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, wait_for, write_model
 
-from edge.cli.user_commands import user_commands
-from edge.pipeline.commands import RESET, Command, CommandLines, Commands, read_stdin
+from edge.pipeline.commands import RESET, Command, CommandLines, Commands, read_stdin, user_commands
 from firmware_bridge.zeroing.baseline import save_baselines
 
 OPEN = []

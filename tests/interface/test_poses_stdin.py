@@ -23,7 +23,7 @@ from edge.pipeline.pose_queue import (
     pose_of_fields,
 )
 from edge.pipeline.run_statistics import Statistics
-from firmware_bridge.schedule import POSES_SILENT_NS
+from firmware_bridge.schedule import SENSOR_SILENT_NS
 
 __all__ = ["files"]
 WHOLE = (
@@ -114,11 +114,11 @@ class TestIntake:
     def test_a_source_that_falls_silent_is_reported_once_and_when_it_is_back(self, step):
         assert step(10**12)[1] == [], "without any pose there is nothing to miss"
         step(0, pose(1), pose(2, sensor="4"), pose(1, sensor="6", holds=True))
-        assert step(POSES_SILENT_NS, pose(3, sensor="4"))[1] == []
-        ((kind, sensor, text),) = step(POSES_SILENT_NS + 1)[1]
+        assert step(SENSOR_SILENT_NS, pose(3, sensor="4"))[1] == []
+        ((kind, sensor, text),) = step(SENSOR_SILENT_NS + 1)[1]
         assert (kind, sensor) == ("poses_silent", None) and "one tap" in text
-        assert step(POSES_SILENT_NS + 2)[1] == []
-        assert step(POSES_SILENT_NS + 10**8, pose(4))[1] == [("poses_back", None, "poses are back after 0.6 s")]
+        assert step(SENSOR_SILENT_NS + 2)[1] == []
+        assert step(SENSOR_SILENT_NS + 10**8, pose(4))[1] == [("poses_back", None, "poses are back after 0.6 s")]
         assert {sensor for _, sensor, _ in step(10**15)[1]} == {None, "4"}, "one that holds is not missed"
 
 

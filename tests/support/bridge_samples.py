@@ -17,7 +17,7 @@ from firmware_bridge.can.slcan import STAMPED_BYTES, CanFrame, SlcanDecoder
 from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
-from firmware_bridge.recording.csv_reader import CSV_HEADER
+from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import Scan
 
@@ -60,7 +60,7 @@ def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None
     """Write a recording as a CSV file, with its rate in a file next to it."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(CSV_HEADER)
+        writer.writerow(csv_header())
         writer.writerows([f"{value}.0" for value in scan.reshape(3, 16).T.ravel()] for scan in counts)
     if rate_hz is not None:
         path.with_name("meta_data.csv").write_text(f"frequency_hz\n{rate_hz}\n")

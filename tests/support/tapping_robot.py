@@ -17,7 +17,7 @@ import shapely
 import trimesh
 from numpy.typing import NDArray
 
-from firmware_bridge.recording.csv_reader import CSV_HEADER, CSV_POSES
+from firmware_bridge.recording.csv_reader import CSV_POSES, csv_header
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -110,7 +110,7 @@ class Robot:
         table = np.concatenate([counts.reshape(len(clean), 48), np.concatenate(stated)], axis=1)
         time_s = np.arange(len(clean))[:, None] / 100
         form = ["%.2f"] + ["%d"] * 48 + ["%.3f"] * 3
-        header = ",".join(("time_s", *CSV_HEADER, *CSV_POSES))
+        header = ",".join(("time_s", *csv_header(), *CSV_POSES))
         np.savetxt(path, np.concatenate([time_s, table], axis=1), form, ",", header=header, comments="")
         return Tapped(np.array(depths), np.array(units))
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from edge.pipeline.result_stream import uncollected
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.recording.csv_reader import CSV_HEADER
+from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 ROOT: Final = Path(__file__).parents[2]
@@ -182,7 +182,7 @@ def _recording(path: Path, number: int, *, pressed: bool) -> Path:
         taxels = np.arange(16)
         away = (taxels // 4 - 1.5 - np.sin(turn)) ** 2 + (taxels % 4 - 1.5 - np.cos(turn)) ** 2
         counts[:, :, 2] += np.rint(3000 * np.exp(-2 * away)).astype(int)  # local, as no drift is
-    np.savetxt(path, counts.reshape(500, -1), "%d", ",", header=",".join(CSV_HEADER), comments="")
+    np.savetxt(path, counts.reshape(500, -1), "%d", ",", header=",".join(csv_header()), comments="")
     return path
 
 

@@ -40,8 +40,7 @@ sys.exit(cli.main(sys.argv[1:]))
 ENDLESS = """
 import ctypes
 from edge.terminal.stop_signals import stop_on_signals
-from edge.cli.user_commands import terminal_keys
-from edge.pipeline.commands import Commands
+from edge.pipeline.commands import Commands, terminal_keys
 
 lock, library = ctypes.create_string_buffer(64), ctypes.CDLL(None)
 with stop_on_signals(), terminal_keys(Commands()):

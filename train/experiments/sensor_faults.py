@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.result import Result
+from edge.perception.result import NOISE_COUNTS, Result
 from edge.perception.runtime import Model, Runtime
-from edge.perception.taps import NOISE_COUNTS
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ScanSeries

@@ -27,13 +27,12 @@ from edge.sinks.ros2.diagnostics import OUTAGES, Diagnostics
 from edge.sinks.ros2.map_messages import contacts, image, in_si, points, taxels
 from edge.sinks.ros2.messages import (
     DIAGNOSTIC_ARRAY,
-    FLOAT64,
     IMAGE,
-    INT8,
     POINT_CLOUD,
     POINT_STAMPED,
     STRING,
     TF_MESSAGE,
+    TYPES,
     WRENCH_STAMPED,
     base_topic,
     frame_of,
@@ -243,9 +242,9 @@ class Ros2Sink(Sink):
 
         for name, value_of in NUMBERS.items():
             number = None if result is None else value_of(result)
-            publish(name, FLOAT64, math.nan if number is None else number)
+            publish(name, TYPES["std_msgs/Float64"], math.nan if number is None else number)
         trusted = None if result is None else result.trusted
-        publish("trusted", INT8, -1 if trusted is None else int(trusted))
+        publish("trusted", TYPES["std_msgs/Int8"], -1 if trusted is None else int(trusted))
         publish("state", STRING, state)
 
     def _place_pads(self) -> None:
