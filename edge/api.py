@@ -131,7 +131,7 @@ def open_source(
         rate_hz: rate at which a recording is played; for a device, the rate that sets the deadlines of its patterns,
             in [Hz].
         give_up_s: longest time that a lost or silent source may be away, in [s]; at 0 its loss is an error at once.
-        force: use a sensor file of an emulated sensor on a device, which opening the source refuses otherwise.
+        force: use a sensor file of an emulated sensor on other scans, too, which opening the source refuses otherwise.
 
     Raises:
         SourceError: the form does not exist, a name occurs twice, or the sources are of several kinds.

@@ -14,9 +14,11 @@ BridgeError
 Bad frames, skipped bytes and torn scans are counted, never raised.
 """
 
+import re
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from shlex import quote
 
 _FOLDER = Path(__file__).resolve().parent.parent
 
@@ -34,6 +36,23 @@ def harmless(text: str, kept: str = "\n\t") -> str:
 def _escaped(letter: str) -> str:
     # Python decodes a byte that is not UTF-8 in a file name as U+DC80 to U+DCFF.
     return f"\\x{ord(letter) - 0xDC00:02x}" if "\udc80" <= letter <= "\udcff" else ascii(letter)[1:-1]
+
+
+def as_typed(text: object) -> str:
+    """Return a name as a person types it in a command, quoted where a shell needs that; it holds no control characters.
+
+    What is not printable is an escape of bash's $'...'.
+    """
+    name = str(text)
+    if name.isprintable():
+        return quote(name)
+    letters = re.sub(r"([\\'])", r"\\\1", name)
+    return f"$'{''.join(one if one.isprintable() else _typed_escape(one) for one in letters)}'"
+
+
+def _typed_escape(letter: str) -> str:
+    # Two digits are a byte to bash, and a letter beyond ASCII has several.
+    return f"\\u{ord(letter):04x}" if "\x80" <= letter <= "\xff" else _escaped(letter)
 
 
 class BridgeError(Exception):
@@ -85,7 +104,7 @@ def how_to_install(extra: str) -> str:
     Of an installed wheel pip needs its name alone, wherever it came from: it adds what the extra lacks.
     """
     where = _FOLDER if (_FOLDER / "pyproject.toml").is_file() else "tactile-edge-sr"
-    return f"pip install '{where}[{extra}]'"
+    return f"pip install {as_typed(f'{where}[{extra}]')}"
 
 
 def need(extra: str, *modules: str) -> None:

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Final, TextIO
 
 from edge.errors import SinkError, UsageError
+from edge.perception.record_fields import FIELDS, Out
 from edge.pipeline.sink import check_new
 from edge.pipeline.source_setup import sensor_settings, unmapped
 from edge.terminal.progress_bar import progress
+from firmware_bridge.errors import as_typed
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
@@ -18,9 +20,12 @@ from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import SensorEntry
 
+_NOT_IN_NPZ: Final = [
+    one.name for one in FIELDS if Out.RECORD in one.out and Out.NPZ not in one.out and one.name != "pose"
+]
 _WITHOUT: Final = {
-    (".mcap", ".npz"): "events, counters, the wall clock, and newtons and temperatures of the vendor's server",
-    (".mcap", ".csv"): "all but counts, times and poses: patterns, events, baselines and the mounting",
+    (".mcap", ".npz"): f"events, counters, the wall clock, and of each record {', '.join(_NOT_IN_NPZ)}",
+    (".mcap", ".csv"): "all but counts, times and poses: errors of poses, patterns, events, baselines, the mounting",
     (".npz", ".mcap"): "what was computed (edge-sr replay computes it), the device's times, later baselines",
     (".csv", ".mcap"): "the time of day, which the file does not state",
 }
@@ -39,11 +44,10 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     if was == ending:
         raise UsageError(f"{source} and {target} have the same format: copy it, or name the new file otherwise")
     if was in _WRITERS and (was, ending) not in _WITHOUT:
-        made = source.with_suffix(".mcap").name
+        made = as_typed(source.with_suffix(".mcap").name)
         rate = f" --rate-hz {options.rate_hz or 'R'}" if was == ".csv" else ""
-        raise UsageError(
-            f"{source} becomes no {ending}: edge-sr convert {source} {made}{rate}; edge-sr convert {made} {target}"
-        )
+        first, then = f"{as_typed(source)} {made}{rate}", f"{made} {as_typed(target)}"
+        raise UsageError(f"{source} becomes no {ending}: edge-sr convert {first}; edge-sr convert {then}")
     if options.rate_hz is not None and was != ".csv":
         raise UsageError(f"--rate-hz is for a .csv alone: {source} has times of its own")
     check_new(target)

@@ -11,7 +11,7 @@ import numpy as np
 from edge.api import DEFAULT_MODEL, POSED_MODEL, Model, ModelError, bundled_models, load_model
 from edge.terminal.argument_types import columns, wrapped
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.errors import DeviceError
+from firmware_bridge.errors import DeviceError, as_typed
 from firmware_bridge.links.discovery import Found, devices
 from firmware_bridge.schedule import Ticker
 
@@ -101,7 +101,7 @@ def page(found: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
         serial = f"serial {one.serial_number}" if one.serial_number else None
         lines += wrapped("  ".join(word for word in (one.path, one.usb_id, serial) if word), width, indent="  ")
         lines += wrapped(f"{'looks like ' if one.adapter else ''}{one.looks_like}", width, "  ", "  ")
-        lines.append(f"  --source {one.source}")
+        lines.append(f"  --source {as_typed(one.source)}")
         for problem in one.problems:
             lines += wrapped(problem, width, "  ! ", "    ")
     for note in (*notes, SERVER_HINT):

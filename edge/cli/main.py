@@ -5,6 +5,7 @@ import contextlib
 import errno
 import importlib
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -63,7 +64,8 @@ def _main(arguments: Sequence[str]) -> int:
         if not isinstance(error, (BridgeError, EdgeError)):
             raise
         with contextlib.suppress(OSError):  # the terminal may have gone
-            print(f"edge-sr: {' '.join(str(error).split())}", file=sys.stderr)
+            line = re.sub(r"\s*[\n\t]\s*", " ", str(error)).strip()  # other spaces may be of a name
+            print(f"edge-sr: {line}", file=sys.stderr)
         return next((code for kind, code in _EXIT_CODES.items() if isinstance(error, kind)), EXIT_USAGE)
 
 

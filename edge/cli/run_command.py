@@ -48,6 +48,7 @@ from edge.pipeline.sink import check_new
 from edge.sinks.registry import check_apart
 from edge.sinks.status_line import MessageSink
 from edge.terminal.stop_signals import stop_on_signals
+from firmware_bridge.errors import as_typed
 from firmware_bridge.in_place import BACKUP_SUFFIX
 
 if TYPE_CHECKING:
@@ -107,7 +108,8 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
 
         kind, known = "replay", sensor_settings(options.sensor, options.id_map)
-        baselines, notes = recorded_baselines(options.source[0].removeprefix("replay:"), known, options.rate_hz)
+        played = options.source[0].removeprefix("replay:")
+        baselines, notes = recorded_baselines(played, known, options.rate_hz, force=options.force)
         print("\n".join(notes), file=err)
     else:
         with stop_on_signals() as stop, _source(options, give_up_s=0) as source:
@@ -133,10 +135,10 @@ def record(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     if path.is_dir():
         raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
     if path.suffix.lower() in (".csv", ".npz", ".json", ".jsonl"):
-        made = path.with_suffix(".mcap")
+        made = as_typed(path.with_suffix(".mcap"))
         then = "for records in JSON use edge-sr --sink jsonl:FILE"
         if path.suffix.lower() in (".csv", ".npz"):
-            then = f"afterwards edge-sr convert {made} {path}"
+            then = f"afterwards edge-sr convert {made} {as_typed(path)}"
         raise UsageError(f"{path.suffix} cannot be recorded: edge-sr record {made}; {then}")
     if path.suffix != ".mcap":
         path = path.with_name(path.name + ".mcap")

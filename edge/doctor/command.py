@@ -37,7 +37,7 @@ from edge.terminal.argument_types import columns, wrapped
 from edge.terminal.progress_bar import drawn, progress, rewritable
 from edge.terminal.stop_signals import stop_on_signals
 from firmware_bridge import in_place
-from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError, harmless
+from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError, as_typed, harmless
 from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.serial_ports import serial_ports
 from firmware_bridge.pad_geometry import USPA44
@@ -114,7 +114,7 @@ class Visit:
 
     def _press_one(self, name: str, whose: str, examined: Examined) -> None:
         geometry, answers = self._known.geometry, self._rehearsal is not None or _stdin_is_terminal()
-        guide = GuidedPress(geometry, weigh=answers)
+        guide = GuidedPress(geometry, weigh=answers, z_noise_counts=examined.z_noise_counts[name])
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
         self._lead(guide, name, examined, whose)
         findings, found = judge_press(guide.presses, geometry, kept=self._options.out is not None)
@@ -243,7 +243,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         failed: BridgeError | None = None
         whole = False
         with reader:
-            refuse_emulated(known, link.kind, options.force)
+            refuse_emulated(known, link.kind, link.origin, options.force)
             try:
                 visit.watch(watched)
                 whole = not stop.is_set()
@@ -282,7 +282,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
             files = [f"kept in {options.out}"] if kept else []
             files += [f"the former file is now {options.out}{in_place.BACKUP_SUFFIX}"] if kept and replaced else []
             if kept and visit.weighed:
-                then = f"python -m train.own {options.out} --recordings FOLDER --out mine"
+                then = f"python -m train.own {as_typed(options.out)} --recordings FOLDER --out mine"
                 files += wrapped(f"train a model for it alone: {then}", columns())
             kind = "" if link.kind == "device" else f" ({link.kind.upper()})"
             early = "" if stopped_s is None else f"stopped after {stopped_s:.0f} s: "
@@ -310,8 +310,8 @@ def check_writable(path: Path, known: SensorFile) -> None:
         raise SensorFileError(f"{path}: cannot be written: {why}: pass --out a file in a folder of yours") from error
     if path.exists() and (known.path is None or known.path.resolve() != path.resolve()):
         raise SensorFileError(
-            f"{path}: left as it is, because what it holds would be lost: pass --sensor {path} as well, to keep what "
-            "is not measured again, or another --out"
+            f"{path}: left as it is, because what it holds would be lost: pass --sensor {as_typed(path)} as well, to "
+            "keep what is not measured again, or another --out"
         )
 
 

@@ -55,12 +55,14 @@ _PRESSED: Final = (
 class Examined:
     """Findings of link and sensors, and by sensor the baselines of the pads that may be zeroed.
 
-    The pads of `loaded` sensors are not free, as an earlier baseline shows.
+    The pads of `loaded` sensors are not free, as an earlier baseline shows. `z_noise_counts` are the standard
+    deviations of each sensor's summed z.
     """
 
     findings: list[Finding]
     baselines: dict[str, Baseline]
     loaded: frozenset[str] = frozenset()
+    z_noise_counts: Mapping[str, float] = field(default_factory=dict)
 
 
 def judge(watched: Watched, unix_time_s: float) -> Examined:
@@ -105,7 +107,8 @@ def judge(watched: Watched, unix_time_s: float) -> Examined:
             baselines[name] = baseline
         findings += [replace(finding, sensor=name) for finding in of_sensor]
     loaded = {one.sensor for one in findings if one.name == "load" and one.remedy == _PRESSED and one.sensor}
-    return Examined(findings, baselines, frozenset(loaded))
+    noise_counts = {name: one.z_sum_noise_counts() for name, one in enough.items()}
+    return Examined(findings, baselines, frozenset(loaded), noise_counts)
 
 
 def check_baseline(
@@ -231,6 +234,6 @@ def examine(
     known = sensor_settings(sensor, id_map)
     reader, known, watched = prepare(texts, known, stored_baselines(baselines, known), rate_hz)
     with reader:
-        refuse_emulated(known, reader.link.kind, force=False)
+        refuse_emulated(known, reader.link.kind, reader.link.origin, force=False)
         watch(reader, watched, duration_s, threading.Event() if stop is None else stop)
     return judge(watched, time.time()).findings

@@ -216,14 +216,17 @@ class GuidedPress:
         weighed: counts per newton of the summed z, where a weight was laid on; else None.
     """
 
-    def __init__(self, geometry: SensorGeometry = USPA44, *, weigh: bool = False) -> None:
-        """Prepare to ask, with `weigh` for a weight, too."""
+    def __init__(self, geometry: SensorGeometry = USPA44, *, weigh: bool = False, z_noise_counts: float = 0.0) -> None:
+        """Prepare to ask, with `weigh` for a weight, too.
+
+        `z_noise_counts` is the standard deviation of the free pad's summed z, which it has under a still weight, too.
+        """
         self.done = False
         self.presses: list[Press] = []
         self.weight_g: float | None = None
         self.weighed: Weighed | None = None
         self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
-        self._dialogue = self._all(geometry.corners, weigh)
+        self._dialogue = self._all(geometry.corners, weigh, z_noise_counts)
         self.first: Final = next(self._dialogue) or ""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
@@ -252,7 +255,7 @@ class GuidedPress:
             self.done = True
             return None
 
-    def _all(self, corners: Sequence[int], weigh: bool) -> Dialogue[None]:
+    def _all(self, corners: Sequence[int], weigh: bool, z_noise_counts: float) -> Dialogue[None]:
         for place, name in zip(corners, CORNERS, strict=True):
             try:
                 press = yield from _corner(place, name)
@@ -267,7 +270,7 @@ class GuidedPress:
         if weigh:
             self.weight_g = yield from _mass_g()
         if self.weight_g is not None:
-            self.weighed = yield from _weigh(self.weight_g)
+            self.weighed = yield from _weigh(self.weight_g, z_noise_counts)
 
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
@@ -320,7 +323,7 @@ def _number(text: str) -> float:
         return np.nan
 
 
-def _weigh(weight_g: float) -> Dialogue[Weighed | None]:
+def _weigh(weight_g: float, z_noise_counts: float) -> Dialogue[Weighed | None]:
     """Return what a weight shows; None where nothing steady was laid on."""
     steady: list[NDArray[np.float32]] = []  # of z
 
@@ -328,9 +331,13 @@ def _weigh(weight_g: float) -> Dialogue[Weighed | None]:
         steady.append(reading.zeroed[2])
         del steady[:-STEADY_SCANS]
         sums = np.abs(np.sum(steady, axis=(1, 2)))
-        low, high = sums.min(), sums.max()
-        still = high - low < max(30.0, 0.02 * high)
-        return bool(len(steady) == STEADY_SCANS and low > 100.0 and still)
+        if len(sums) < STEADY_SCANS or sums.min() <= 100.0:
+            return False
+        # Noise alone spreads 50 readings over 4.5 of its deviations, and the means of ten of them over 0.7; hardly ever
+        # over these limits.
+        allowed, means = max(30.0, 0.02 * sums.max()), sums.reshape(5, -1).mean(axis=1)
+        spread_by_noise = np.ptp(sums) < max(allowed, 7 * z_noise_counts)
+        return bool(spread_by_noise and np.ptp(means) < max(allowed, 1.5 * z_noise_counts))
 
     ask = f"Lay {weight_g:g} g on the pad, flat and covering all of it, hands off."
     laid = yield from _wait(ask, lies_still, 1)

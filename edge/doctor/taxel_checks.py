@@ -69,11 +69,14 @@ class Samples:
         both = self.fresh[1:] & self.fresh[:-1]
         steps = around_counts(np.diff(self.counts, axis=0))
         for taxel in np.flatnonzero(self.living):
-            sizes = np.sort(np.abs(steps[both[:, taxel], :, taxel]), axis=0)
-            kept = sizes[: int(0.98 * len(sizes))].astype(np.float64)
-            if len(kept):  # of a normal variable of deviation 1 the RMS is then 0.9346
-                noise[:, taxel] = np.sqrt((kept**2).mean(axis=0) / 2) / 0.9346
+            noise[:, taxel] = _noise_of(steps[both[:, taxel], :, taxel])
         return noise
+
+    def z_sum_noise_counts(self) -> float:
+        """Return the standard deviation of z summed over the living taxels, likewise."""
+        whole = self.fresh[:, self.living].all(axis=1)
+        steps = around_counts(np.diff(self.counts[:, 2, self.living], axis=0)).sum(axis=1)
+        return float(_noise_of(steps[whole[1:] & whole[:-1]]))
 
     def rest_counts(self) -> NDArray[np.float64]:
         """Return (3, taxels), the median reading; NaN where a taxel is not living."""
@@ -91,6 +94,15 @@ class Samples:
             if len(read):
                 medians[:, taxel] = (read[0] + np.median(around_counts(read - read[0]), axis=0)) % COUNTS_ON_CIRCLE
         return medians
+
+
+def _noise_of(steps: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return the standard deviation of readings (...) from the steps between them (n, ...), without rare large ones."""
+    sizes = np.sort(np.abs(steps), axis=0)
+    kept = sizes[: int(0.98 * len(sizes))].astype(np.float64)
+    if not len(kept):
+        return np.full(steps.shape[1:], np.nan)
+    return np.sqrt((kept**2).mean(axis=0) / 2) / 0.9346  # of a normal variable of deviation 1 the RMS is then 0.9346
 
 
 def around_counts(steps: NDArray[Any]) -> NDArray[Any]:

@@ -278,18 +278,18 @@ FIELDS: Final = (
     Field("force_counts", _REAL, "force_counts", "summed z over the baseline", decimals=1, byte=104),
     Field("force_n", _REAL, "force_n",
           "the same in newtons, with `--counts-per-newton`; else the vendor's z force, where its server gives one",
-          decimals=4, out=_RECORD_ROS, byte=112),
-    Field("area_mm2", _REAL, "area_mm2", "touched area", decimals=3, out=_RECORD_ROS, byte=120),
+          decimals=4, byte=112),
+    Field("area_mm2", _REAL, "area_mm2", "touched area", decimals=3, byte=120),
     Field("centroid_mm", _REAL, "centroid_mm", "centroid of the touched area, from the pad's centre, x right, y down",
-          decimals=4, parts=("centroid_x_mm", "centroid_y_mm"), out=_RECORD_ROS, byte=128),
+          decimals=4, parts=("centroid_x_mm", "centroid_y_mm"), byte=128),
     Field("interval_mm", _REAL, "interval_mm",
           "how far off a touched pixel may be: half of the interval that holds the truth of 90 % of pixels, mean over "
           "the touched area", decimals=5, byte=144),
     Field("expected_rmse_mm", _REAL, "expected_rmse_mm",
           "RMS error, over all pixels, that patterns of the same uncertainty had on taps not trained on",
           decimals=5, byte=152),
-    Field("another_tap", _YES_OR_NO, "another_tap", "whether another tap is expected to take away 2 % of it; unknown "
-          "where the model takes no further one", out=_RECORD_NPZ, byte=72),
+    Field("another_tap", _YES_OR_NO, "another_tap", "whether another tap is expected to take away 2 % of the "
+          "error; unknown where the model takes no further one", out=_RECORD_NPZ, byte=72),
     Field("next_tap", _REAL, "next_tap", "from the end of a tap to the next one: where to touch next, dx, dy in mm and "
           "turn in degrees from the newest tap's pad; records hold `target` too, the same pose in the object's plane; "
           "unknown without poses",
@@ -331,7 +331,7 @@ FIELDS: Final = (
     Field("run_time_us", _REAL, "run_time_us", "time of the inference, of all sensors in one call; unknown where the "
           "pattern was there already", decimals=1, byte=168),
     Field("latency_us", _REAL, "latency_us", "from the read that gave the scan's last byte to the pattern",
-          decimals=1, out=_RECORD_ROS, byte=176),
+          decimals=1, byte=176),
     Field("baseline", Kind("text", "<U16", unknown=""), "baseline", "id of the baseline", make=attrgetter("id"),
           out=_RECORD_NPZ),
     Field("baseline_origin", _TEXT, "baseline", "`start-up`, `file` or `demand`; or from the "

@@ -6,14 +6,13 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from shlex import quote
 from types import MappingProxyType
 from typing import Any
 
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import sensor_settings, unmapped, with_recorded
+from edge.pipeline.source_setup import refuse_emulated, sensor_settings, unmapped, with_recorded
 from edge.terminal.progress_bar import progress
-from firmware_bridge.errors import BaselineRefusedError
+from firmware_bridge.errors import BaselineRefusedError, as_typed
 from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.tracks import Recording
@@ -68,34 +67,33 @@ def open_recording(
     if sensor is None:  # else a note reports the sensors that the file lacks
         sensors |= {track.sensor for track in tracks}
     entries = {
-        name: SensorEntry(
-            mountings.get(name, Mounting(taxel_count=file.geometry.taxel_count)),
-            entry.counts_per_newton,
-            baselines.get(name),
-            entry.pad,
-            entry.learned,
-            frame=entry.frame,
-            counts_per_newton_interval=entry.counts_per_newton_interval,
+        name: replace(
+            known.sensors.get(name, SensorEntry()),
+            mounting=mountings.get(name, Mounting(taxel_count=file.geometry.taxel_count)),
+            baseline=baselines.get(name),
         )
         for name in sorted(sensors)
-        for entry in [known.sensors.get(name, SensorEntry())]
     }
     known = replace(known, sensors=entries)
     place_recordings(replay, file.mountings)
     return Source(replay, sensor_file=known, rate_hz=rate_hz)
 
 
-def recorded_baselines(text: str, known: SensorFile, rate_hz: float | None) -> tuple[dict[str, Baseline], list[str]]:
+def recorded_baselines(
+    text: str, known: SensorFile, rate_hz: float | None, *, force: bool
+) -> tuple[dict[str, Baseline], list[str]]:
     """Return the baselines of FILE[,FILE], from where each pad is free and still, and notes where that is.
 
-    `rate_hz` is that of each sensor, where a file does not state it.
+    `rate_hz` is that of each sensor, where a file does not state it; `force` as in `Source`.
 
     Raises:
         BaselineRefusedError: a pad is nowhere free and still.
         RecordingError: a recording cannot be used.
+        SensorFileError: the sensor file is of an emulated sensor, and the recording is not.
         SourceError: its rate is unknown or out of range.
     """
     replay = ReplayLink(recording_paths(text), rate_hz)
+    refuse_emulated(known, replay.kind, replay.origin, force)
     baselines = free_baselines(replay, with_recorded(known, [replay]).mountings, opening=True, rate_hz=rate_hz)
     sensors = {track.sensor for recording in replay.recordings for track in recording.tracks}
     notes = [notice.text for notice in replay.notices()]
@@ -159,7 +157,7 @@ def _remedy(path: Path, rate_hz: float | None) -> str:
     rate = "" if rate_hz is None else f" --rate-hz {rate_hz:g}"
     return (
         "If it holds something all the time, take the baseline of a recording of this sensor in which it lets go: "
-        f"edge-sr baseline --source replay:OTHER{rate} --out zero.json; edge-sr replay {quote(str(path))}{rate} "
+        f"edge-sr baseline --source replay:OTHER{rate} --out zero.json; edge-sr replay {as_typed(path)}{rate} "
         "--baseline zero.json shows patterns, marked as not to be believed"
     )
 

@@ -1,7 +1,6 @@
 """Statistics of a run, in memory that does not grow with it; and advice to a person whose source gives no scan."""
 
 import math
-import shlex
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,6 +9,7 @@ from typing import Final
 
 from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
+from firmware_bridge.errors import as_typed
 from firmware_bridge.zeroing.drift_tracker import Drift
 
 BUCKETS_PER_OCTAVE: Final = 32  # a quantile is at most 2.2 % too high
@@ -223,7 +223,7 @@ _MESSAGES: Final = {
 
 def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int]]) -> str:
     """Return what came of the sources, as the user named them, what may be wrong, and what to do."""
-    source = f" --source {shlex.quote(sources[0])}" if len(sources) == 1 else ""
+    source = f" --source {as_typed(sources[0])}" if len(sources) == 1 else ""
     doctor = f"edge-sr doctor{source} shows what is wrong"
     arrived = Counter(counters())
     received, bad, binary = arrived["received_bytes"], arrived["bad_lines"], arrived["non_ascii_lines"]

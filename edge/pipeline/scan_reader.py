@@ -54,7 +54,7 @@ class Source:
     ) -> None:
         """Prepare to read one or more links that are not open yet; this source opens and closes them.
 
-        With `force` a device also gets properties that the sensor file has from an emulated sensor. A lost link is
+        With `force` other scans, too, get properties that the sensor file has from an emulated sensor. A lost link is
         opened again; `give_up_s` is the longest time that one may be away, in [s], and at 0 its first loss is raised.
 
         Raises:
@@ -102,7 +102,7 @@ class Source:
 
         Raises:
             UsageError: it was opened before.
-            SensorFileError: the sensor file is of an emulated sensor, and this is a device.
+            SensorFileError: the sensor file is of an emulated sensor, and the scans are not.
             BridgeError: a link cannot be opened.
         """
         if self._opened or self._closed:
@@ -112,7 +112,7 @@ class Source:
             for reader in self._readers:
                 opening.enter_context(reader)
             kind = _one_kind([reader.link for reader in self._readers])  # some know their kind only now
-            refuse_emulated(self.sensor_file, kind, self._force)
+            refuse_emulated(self.sensor_file, kind, self.origin, self._force)
             if not self.patient:
                 opening.callback(self._end_reading)
                 self._threads = [self._started(reader) for reader in self._readers]

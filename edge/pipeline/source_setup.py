@@ -70,20 +70,23 @@ def with_recorded(known: SensorFile, links: Iterable[Link]) -> SensorFile:
     return replace(known, sensors=recorded | dict(known.sensors))
 
 
-def refuse_emulated(known: SensorFile, kind: SourceKind, force: bool) -> None:
-    """Refuse to use settings of an emulated sensor on a device unless forced.
+def refuse_emulated(known: SensorFile, kind: SourceKind, origin: SourceKind | None, force: bool) -> None:
+    """Refuse to use settings of an emulated sensor on a device, or on a recording of anything else, unless forced.
 
     Raises:
         SensorFileError: the sensor file is of an emulated sensor, in part or whole.
     """
-    if kind != "device" or force:
+    if "emulated" in (kind, origin) or force:
         return
+    this, instead = "is a device", "add --force"
+    if kind == "replay":
+        this, instead = "recording is not known to be of one", "leave --sensor out"
     for name, entry in known.sensors.items():
         if entry.emulated:
             parts = ", ".join(part for part in PARTS if part in entry.emulated)
             raise SensorFileError(
-                f"the sensor file has {parts} of an emulated sensor {name}, and this is a device: write a new one with "
-                "edge-sr doctor --out, or add --force"
+                f"the sensor file has {parts} of an emulated sensor {name}, and this {this}: write a new one with "
+                f"edge-sr doctor --out, or {instead}"
             )
 
 

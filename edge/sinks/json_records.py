@@ -46,6 +46,8 @@ COUNTED_NS: Final = 1_000_000_000  # time from which on a sensor's record has th
 _HEADS: Final = tuple(field for field in FIELDS if Out.RECORD in field.out)
 _ALL: Final = tuple(field.name for field in (*_HEADS, *MAPS))
 CONTACTS: Final = "contacts"  # separate contacts, which take as long as the pattern: in a record only if it is named
+CHOICES: Final = (*_ALL, "counters", CONTACTS)
+"""Names that --fields takes; counters come on their turn in every record, named or not."""
 
 
 class RecordForm:
@@ -96,9 +98,9 @@ def chosen_fields(text: str) -> frozenset[str]:
     from difflib import get_close_matches
 
     names = frozenset(name.strip() for name in text.split(","))
-    for name in sorted(names.difference((*_ALL, CONTACTS))):
-        near = get_close_matches(name, _ALL, n=1)
-        meant = f"did you mean {near[0]}?" if near else f"expected {', '.join(_ALL)}"
+    for name in sorted(names.difference(CHOICES)):
+        near = get_close_matches(name, CHOICES, n=1)
+        meant = f"did you mean {near[0]}?" if near else f"expected {', '.join(CHOICES)}"
         raise UsageError(f"no field {name!r}: {meant}")
     return names
 

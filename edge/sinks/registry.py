@@ -15,7 +15,7 @@ from edge.perception.result import Result
 from edge.pipeline.commands import Commands
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from firmware_bridge.errors import how_to_install
+from firmware_bridge.errors import as_typed, how_to_install
 from firmware_bridge.poses import TimedPose
 
 LOOK_NS: Final = 500_000_000
@@ -131,7 +131,8 @@ def check_sink(text: str) -> tuple[str, str]:
     form = FORMS.get(name)
     if name == "npz" and target:
         made = Path(target).with_suffix(".mcap")
-        raise UsageError(f"no sink {text!r}: record by --sink mcap:{made}, then edge-sr convert {made} {target}")
+        then = f"edge-sr convert {as_typed(made)} {as_typed(target)}"
+        raise UsageError(f"no sink {text!r}: record by --sink {as_typed(f'mcap:{made}')}, then {then}")
     if form is None or (text != name if form.text == name else not target):
         raise UsageError(f"no sink {text!r}; sinks are {', '.join(form.text for form in FORMS.values())}")
     form.check(target)

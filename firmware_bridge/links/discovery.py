@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
-from firmware_bridge.errors import DeviceError
+from firmware_bridge.errors import DeviceError, as_typed
 from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, holders, serial_ports
 
 SYS_ROOT: Final = Path("/sys")
@@ -31,7 +31,7 @@ class CanNetwork(NamedTuple):
         if self.up:
             return None
         how = f" type can bitrate {BITRATE_BIT_S} restart-ms 100" if self.driver else ""
-        return f"is down: sudo ip link set {self.name} up{how}"
+        return f"is down: sudo ip link set {as_typed(self.name)} up{how}"
 
 
 def can_networks(sys_root: Path = SYS_ROOT) -> list[CanNetwork]:

@@ -14,7 +14,7 @@ import usb.util
 from usb.backend import IBackend
 
 from firmware_bridge.can import gs_usb
-from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
+from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError, as_typed
 from firmware_bridge.links.base import SourceKind, not_open
 from firmware_bridge.links.frame_link import FrameLink
 from firmware_bridge.links.known_adapters import GS_USB_ADAPTERS
@@ -220,7 +220,7 @@ def find_gs_usb(
     what = f"no gs_usb adapter{which}: plug it in, or name another source"
     if len(fitting) > 1:
         named = next((name for one in present if (name := source_name(one, present))), "gs_usb:SERIAL")
-        what = f"{len(fitting)} gs_usb adapters{which}: name one, such as --source {named}"
+        what = f"{len(fitting)} gs_usb adapters{which}: name one, such as --source {as_typed(named)}"
     elif known.device is not None and wanted in [one.serial_number for one in present]:
         what = f"no gs_usb adapter{which} that is surely the one: plug it in where it was, at {known.device.place}"
     named_by_serial = wanted is not None and not placed

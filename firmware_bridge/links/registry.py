@@ -7,7 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-from firmware_bridge.errors import SourceError
+from firmware_bridge.errors import SourceError, as_typed
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.serial_ports import find_adapter, find_by_serial, serial_ports
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
@@ -171,7 +171,8 @@ def _port_and_baud(text: str, rest: str) -> tuple[str, int | None]:
     if port in ("", "serial="):
         raise _refusal(text)
     if at and not re.fullmatch(r"[1-9][0-9]{0,7}", baud):
-        raise SourceError(f"baud is {baud[:20]!r}, expected 1 to 99999999 after the @: --source slcan:{port}@115200")
+        right = as_typed(f"slcan:{port}@115200")
+        raise SourceError(f"baud is {baud[:20]!r}, expected 1 to 99999999 after the @: --source {right}")
     if port.startswith("serial="):
         port = find_by_serial(port.removeprefix("serial="), serial_ports()).path
     return port, int(baud) if at else None
@@ -180,7 +181,7 @@ def _port_and_baud(text: str, rest: str) -> tuple[str, int | None]:
 def _refusal(text: str) -> SourceError:
     form = _meant(text)
     if form is not None:
-        return SourceError(f"source is {text!r}: did you mean {form}?")
+        return SourceError(f"source is {text!r}: did you mean {as_typed(form)}?")
     return SourceError(f"source is {text!r}, expected one of: {', '.join(FORMS)}")
 
 

@@ -10,7 +10,7 @@ from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from firmware_bridge.errors import NoDeviceError
+from firmware_bridge.errors import NoDeviceError, as_typed
 from firmware_bridge.links.known_adapters import FTDI_X, SLCAN_ADAPTERS
 
 LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
@@ -213,7 +213,7 @@ def in_use(path: str) -> str:
 
 def _example(port: Port) -> str:
     named = f"serial={port.serial_number}" if port.serial_number else port.path
-    return f"such as --source slcan:{named}, or try --source demo"
+    return f"such as --source {as_typed(f'slcan:{named}')}, or try --source demo"
 
 
 def _seen(ports: Sequence[Port]) -> str:

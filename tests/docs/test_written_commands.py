@@ -288,6 +288,13 @@ def test_options_that_are_spoken_of_exist():
                 assert option in known, f"{page.name}: {text}"
 
 
+def test_every_option_is_spoken_of():
+    spoken = {option for page in written_samples.PAGES for option in re.findall(r"--[a-z][a-z0-9-]*", page.read_text())}
+    for command in ("", *cli.COMMANDS):
+        options = set(re.findall(r"^ *(--[a-z][a-z0-9-]*)", cli.parser(command).format_help(), re.MULTILINE))
+        assert options - {"--version"} <= spoken, f"edge-sr {command}: {options - spoken}"  # this is as anywhere
+
+
 @pytest.mark.parametrize(
     "snippet",
     [

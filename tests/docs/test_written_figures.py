@@ -12,10 +12,12 @@ import pytest
 from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT
 
+from edge.api import Statistics, open_source
 from edge.cli import main as cli
 from edge.inference.bundled import demo_recording, find_model
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.perception.result import REASON_TEXTS
+from edge.sinks.json_records import CHOICES, PROGRESS
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAINS, PAD_RANGES, Pad
@@ -36,9 +38,9 @@ FAMILIES = {
 """Names that the README gives to rows of reports/families.md."""
 
 
-def told(heading: str) -> set[str]:
-    """Keys of the table under a heading."""
-    section = FORMATS.split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
+def told(heading: str, page: str = FORMATS) -> set[str]:
+    """Keys of the table under a heading of a page."""
+    section = page.split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
     first = [re.split(r"(?<!\\)\|", line)[1] for line in section.splitlines() if line.startswith("| `")]
     return {key for cell in first for key in re.findall(r"`([\w.]+)`", cell)}
 
@@ -60,6 +62,21 @@ def test_keys_of_a_record(tmp_path):
         of_robot = {name for name in arrays.files if name == "pose" or name.startswith("pose_")}  # on the page of poses
         assert set(arrays.files) - of_robot <= told("Records") | told("npz")
     assert load_recording(tmp_path / "records.npz").tracks
+
+
+def test_all_that_the_pages_say_of_a_record_can_be_chosen_and_nothing_else():
+    for name in told("Records") | {"contacts"}:
+        assert cli.parsed_options("demo", ["--sink", "jsonl:-", "--fields", name]).fields == name
+    assert set(CHOICES) == told("Records") | {"contacts"}
+
+
+def test_each_counter_is_explained_and_those_that_grow_while_all_is_well_come_first():
+    page = (ROOT / "docs" / "run.md").read_text()
+    links = ("slcan:/dev/ttyUSB0", "gs_usb", "can:socketcan:can0", "xela-server:ws://127.0.0.1")
+    counters = {name for link in links for name in open_source(link).counters()} | Statistics().counters().keys()
+    assert counters == told("When the wire fails", page)
+    first = next(line for line in page.splitlines() if line.startswith("| `received_bytes`"))
+    assert {*re.findall(r"`(\w+)`", first), "poses"} == PROGRESS
 
 
 def test_keys_of_the_contract_and_of_datasets():

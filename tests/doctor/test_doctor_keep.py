@@ -1,14 +1,17 @@
 """The doctor's sensor file, never less than it held and marked where emulated, and the summary of what was found."""
 
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
+from bridge_samples import write_recording
 from doctor_samples import as_scans, healthy_counts
 from edge_samples import BASELINE, FakeLink
 from test_doctor_command import doctor, examined, recording
 
 from edge.api import Baseline, Pad, SensorFileError, Source
+from edge.cli.main import main
 from edge.doctor.command import check_writable, keep
 from edge.doctor.findings import Finding, summary
 from edge.pipeline.gain_keeper import keep_learned
@@ -119,10 +122,25 @@ def test_a_device_refuses_an_emulated_sensor_unless_forced():
         Source(FakeLink([], kind="device"), sensor_file=EMULATED),
     ):
         pass
-    for kind, force in (("device", True), ("emulated", False), ("replay", False)):
+    for kind, force in (("device", True), ("emulated", False)):
         with Source(FakeLink([], kind=kind), sensor_file=EMULATED, force=force):
             pass
-    refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", force=False)
+    refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", None, force=False)
+
+
+@pytest.mark.parametrize(
+    "command", ["replay FILE", "--source replay:FILE", "doctor --no-press --source replay:FILE",
+                "baseline --out zero.json --source replay:FILE"],
+)  # fmt: skip
+def test_so_does_a_recording_that_is_not_known_to_be_of_one(tmp_path, capsys, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    save_sensor_file(Path("s.toml"), EMULATED)
+    write_recording(Path("rest.csv"), healthy_counts(200))
+    arguments = [*command.replace("FILE", "rest.csv").split(), "--rate-hz", "100"]
+    assert main([*arguments, "--sensor", "s.toml"]) == 2
+    words = "this recording is not known to be of one: write a new one with edge-sr doctor --out, or leave --sensor out"
+    assert words in capsys.readouterr().err and not Path("zero.json").exists()
+    assert main(arguments) == 0
 
 
 WELL = as_scans(healthy_counts(200))

@@ -1,5 +1,6 @@
 """`edge-sr convert`: all that a recording holds is in the new file, and nothing is replaced, lost or left behind."""
 
+import re
 import signal
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import fake_source, make_scan
+from edge_samples import ROOT, fake_source, make_scan
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, record_into, same_scan
@@ -17,6 +18,7 @@ from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, recor
 from edge.api import PadPose, Result, Scan, TimedPose
 from edge.cli import main as cli
 from edge.perception.record_fields import MAPS
+from edge.sinks.json_records import record
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2.map_messages import image, recorded_map
 from edge.sinks.ros2.messages import GRID, IMAGE
@@ -68,7 +70,7 @@ def test_arrays_hold_every_scan_with_its_result_maps_baseline_and_poses(made):
         assert (rows["state"][row], rows["source"][row], rows["model"][row]) == (result.state, "emulated", result.model)
         assert rows["has_pattern"][row] == (result.pattern is not None)
         assert rows["contact"][row] == (-1 if result.contact is None else result.contact)
-        for name in ("force_counts", "interval_mm", "baseline_age_s"):
+        for name in ("force_counts", "force_n", "area_mm2", "centroid_mm", "interval_mm", "baseline_age_s"):
             value = np.nan if (value := getattr(result, name)) is None else value
             np.testing.assert_allclose(rows[name][row], value, atol=0.06)
         assert rows["baseline"][row] == ("" if result.baseline is None else result.baseline.id)
@@ -82,6 +84,16 @@ def test_arrays_hold_every_scan_with_its_result_maps_baseline_and_poses(made):
                 assert not rows[field.name][row].any()
     assert set(arrays["origin"]) == {"emulated"} and arrays["pose_sensor"].tolist() == ["4"] * 6
     assert arrays["pose"][1].tolist() == [4.0, -4 / 3, 40.0, 0.4, 0.5]
+
+
+def test_each_key_of_a_record_is_an_array_or_is_named_as_left_out(made, capsys):
+    path, results = made
+    arrays = arrays_of(path)
+    left_out = set(re.findall(r"\w+", capsys.readouterr().out.partition("not in it: ")[2]))
+    table = (ROOT / "docs" / "recordings.md").read_text().partition("| `.mcap`, [`.npz`]")[2].partition("\n")[0]
+    assert not left_out & arrays.keys()
+    for name in record(results[-1], {}).keys() - arrays.keys() - {"poses"}:  # these of models that take them alone
+        assert name in left_out and name in table
 
 
 def test_maps_that_an_earlier_release_recorded_as_images_are_converted_alike(made, tmp_path):

@@ -1,4 +1,4 @@
-"""Bars on a real pseudo-terminal, none anywhere else, and patterns drawn as text."""
+"""Bars on a real pseudo-terminal, none anywhere else; commands of advice; and patterns drawn as text."""
 
 import contextlib
 import fcntl
@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import struct
+import subprocess
 import termios
 import threading
 from types import SimpleNamespace
@@ -126,6 +127,34 @@ def test_zeroing_shows_its_bar_and_leaves_no_trace_when_it_is_stopped(tmp_path, 
     shown = "".join(said) + terminal.said()
     assert re.search(r"zeroing:   0%\|", shown)
     assert re.search(r"\r +\redge-sr: stopped before every sensor was zeroed", shown)
+
+
+ODD = ["a  b", "it's", "a;b$c`d", "tab\there\nthere", "\x1b[31mred", "back\\slash\x1b", "\x9b\u202eé", "\udcff"]
+
+
+@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize(
+    ("command", "advice", "meant"),
+    [
+        (["convert", "NAME.npz", "NAME.csv"], "becomes no .csv: ", ["NAME.npz", "NAME.mcap", "NAME.mcap", "NAME.csv"]),
+        (["record", "NAME.npz"], "cannot be recorded: ", ["NAME.mcap", "NAME.mcap", "NAME.npz"]),
+        (["--sink", "npz:NAME.npz"], ", then ", ["NAME.mcap", "NAME.npz"]),
+        (["--source", "NAME.csv"], "did you mean ", ["replay:NAME.csv"]),
+    ],
+)
+def test_a_command_of_advice_can_be_typed_whatever_a_file_is_called(name, command, advice, meant, capsys):
+    """As bash takes it: its arguments that hold the name are those of the files."""
+    assert cli.main([word.replace("NAME", name) for word in command]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.isprintable()
+    typed = line.partition(advice)[2].removesuffix("?")
+    if not typed.startswith("edge-sr"):
+        typed = f"edge-sr {typed}"
+    script = 'edge-sr() { printf "%s\\0" "$@"; }; afterwards() { "$@"; }; ' + typed
+    bash = ["bash", "-c", script.encode(errors="surrogateescape")]
+    done = subprocess.run(bash, capture_output=True, check=True, env=os.environ | {"LC_ALL": "C.UTF-8"})
+    words = done.stdout.decode(errors="surrogateescape").split("\0")
+    assert [one for one in words if "." in one] == [one.replace("NAME", name) for one in meant]
 
 
 ESCAPE = re.compile(r"\x1b\[[0-9;]*m")
