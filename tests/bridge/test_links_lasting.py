@@ -201,7 +201,7 @@ def test_trouble_is_told_twice_and_lost_stamps_once():
     ]
 
 
-def test_a_clock_that_was_set_by_readings_which_waited_gives_no_times():
+def test_a_clock_set_by_readings_that_waited_gives_no_times():
     """Stamps of readings that nobody fetched set the adapter's clock, and by it they were new."""
     unread, ms = Unread(), 1_000_000
     unread.empty_ns = 0
