@@ -317,8 +317,8 @@ class ObjectMap:
             return -top_mm  # its top is taken to be as high as the first press's, which is 0
         information, there = seen[both, 2], before[both]
         weight = information * there[:, 2] / (information + there[:, 2])
-        apart_mm = there[:, 3] / there[:, 2] - seen[both, 3] / information
-        return float(weight @ apart_mm / weight.sum())
+        offsets_mm = there[:, 3] / there[:, 2] - seen[both, 3] / information
+        return float(weight @ offsets_mm / weight.sum())
 
     def _worth(self, pose: PadPose) -> float:
         """Return how many taps a pattern is worth beside those before: a whole one a pitch away, under other taxels.

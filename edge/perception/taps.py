@@ -142,8 +142,8 @@ def next_shift_mm(places_mm: NDArray[np.floating], reach_mm: float) -> tuple[flo
     Places (K, 2) of the taps so far are in the newest one's axes, and the next one must not be further than the reach
     from any of them; None where each place was touched or is out of reach.
     """
-    apart_mm = np.hypot(*(_SHIFTS_MM[:, None] - places_mm).transpose(2, 0, 1))
-    free = (apart_mm > _HALF_PITCH_MM / 2).all(axis=1) & (apart_mm <= reach_mm).all(axis=1)
+    distances_mm = np.hypot(*(_SHIFTS_MM[:, None] - places_mm).transpose(2, 0, 1))
+    free = (distances_mm > _HALF_PITCH_MM / 2).all(axis=1) & (distances_mm <= reach_mm).all(axis=1)
     if not free.any():
         return None
     from_middle_mm = np.hypot(*(_SHIFTS_MM - places_mm.mean(axis=0)).T)
