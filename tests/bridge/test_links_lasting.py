@@ -210,7 +210,7 @@ def test_a_clock_set_by_readings_that_waited_gives_no_times():
     assert (old.unread_ns, old.device_ns, old.not_before_ns) == (100 * ms, None, 0)
     (old,) = unread.mark([scan], 101 * ms, clock_begun_ns=-ms)
     assert (old.unread_ns, old.device_ns) == (100 * ms, 99 * ms)
-    unread.found(101 * ms, 103 * ms)
+    unread.note_data(101 * ms, 103 * ms)
     assert unread.empty_ns == 0, "until all data is read, the duration of a read is no evidence"
     unread.empty_ns = 101 * ms
     assert unread.mark([replace(scan, time_ns=102 * ms)], 102 * ms, None)[0].unread_ns == 0
