@@ -56,10 +56,10 @@ def chosen(everyone: list[Subject], names: list[str] | None) -> list[Subject]:
     """Return the subjects of these names, or all if there are no names; raises UsageError for an unknown one."""
     if names is None:
         return everyone
-    known = {subject.name for subject in everyone}
+    available = {subject.name for subject in everyone}
     for name in names:
-        if name not in known:
-            raise UsageError(f"--only {name}: not one of {', '.join(sorted(known))}")
+        if name not in available:
+            raise UsageError(f"--only {name}: not one of {', '.join(sorted(available))}")
     return [subject for subject in everyone if subject.name in names]
 
 

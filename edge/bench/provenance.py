@@ -117,8 +117,8 @@ def _cpu() -> str:
     """Return the model name of the processor; on ARM, where /proc/cpuinfo has none, the board's name."""
     for path, pattern in (("/proc/cpuinfo", r"^model name\s*:\s*(.+)$"), ("/proc/device-tree/model", r"^([^\0]+)")):
         with suppress(OSError):
-            if found := re.search(pattern, Path(path).read_text(errors="replace"), re.MULTILINE):
-                return found[1].strip()
+            if match := re.search(pattern, Path(path).read_text(errors="replace"), re.MULTILINE):
+                return match[1].strip()
     return platform.processor() or "unknown CPU"
 
 
@@ -135,7 +135,7 @@ def _content(file: Path) -> bytes:
     tree = ast.parse(file.read_bytes())
     for node in ast.walk(tree):
         if isinstance(body := getattr(node, "body", None), list):
-            body[:] = [one for one in body if not _is_aside(one)] or [ast.Pass()]
+            body[:] = [statement for statement in body if not _is_aside(statement)] or [ast.Pass()]
     return ast.unparse(tree).encode()
 
 

@@ -60,9 +60,9 @@ def contact_iou(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -
 
     If both are empty they agree: 1.
     """
-    found = _touched(pattern, touching, level)
-    union = np.sum(found | touching, axis=(-2, -1))
-    overlap = np.sum(found & touching, axis=(-2, -1))
+    contact = _touched(pattern, touching, level)
+    union = np.sum(contact | touching, axis=(-2, -1))
+    overlap = np.sum(contact & touching, axis=(-2, -1))
     return np.where(union > 0, overlap / np.maximum(union, 1), 1.0)
 
 
@@ -74,23 +74,23 @@ def boundary_distance_mm(
     Takes and returns as `contact_iou`, (n, H, W) and (n,), in [mm]. If both contacts are empty they agree: 0. If only
     one is, they are the map's diagonal apart.
     """
-    found = _touched(pattern, touching, level)
-    distance_px = np.zeros(len(found))
-    for i, outlines in enumerate(zip(_outlines(found), _outlines(touching), strict=True)):
-        one, other = (np.argwhere(pixels).astype(np.float32) for pixels in outlines)
-        if len(one) and len(other):
-            between = np.hypot(*(one[:, None] - other[None]).transpose(2, 0, 1))
+    contact = _touched(pattern, touching, level)
+    distance_px = np.zeros(len(contact))
+    for i, outlines in enumerate(zip(_outlines(contact), _outlines(touching), strict=True)):
+        points, true_points = (np.argwhere(pixels).astype(np.float32) for pixels in outlines)
+        if len(points) and len(true_points):
+            between = np.hypot(*(points[:, None] - true_points[None]).transpose(2, 0, 1))
             distance_px[i] = (between.min(axis=0).mean() + between.min(axis=1).mean()) / 2
-        elif len(one) or len(other):
-            distance_px[i] = np.hypot(*found.shape[1:])
+        elif len(points) or len(true_points):
+            distance_px[i] = np.hypot(*contact.shape[1:])
     return distance_px * pixel_mm
 
 
 def _touched(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -> NDArray[np.bool_]:
-    found = touched(np.asarray(pattern), level)
-    if found.shape != touching.shape:
-        raise ValueError(f"pattern of shape {found.shape} against contact of shape {touching.shape}, expected equal")
-    return found
+    contact = touched(np.asarray(pattern), level)
+    if contact.shape != touching.shape:
+        raise ValueError(f"pattern of shape {contact.shape} against contact of shape {touching.shape}, expected equal")
+    return contact
 
 
 def _outlines(touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -134,8 +134,8 @@ def _similarity(
     """Return the similarity within windows, over which `mean` averages; `sampled` corrects their variances."""
     mean_a, mean_b = mean(a), mean(b)
     var_a, var_b, covariance = (
-        sampled * (mean(one * other) - at_one * at_other)
-        for one, other, at_one, at_other in ((a, a, mean_a, mean_a), (b, b, mean_b, mean_b), (a, b, mean_a, mean_b))
+        sampled * (mean(x * y) - mean_x * mean_y)
+        for x, y, mean_x, mean_y in ((a, a, mean_a, mean_a), (b, b, mean_b, mean_b), (a, b, mean_a, mean_b))
     )
     c1, c2 = (0.01 * full_scale) ** 2, (0.03 * full_scale) ** 2
     return ((2 * mean_a * mean_b + c1) * (2 * covariance + c2)) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))

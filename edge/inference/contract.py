@@ -154,7 +154,7 @@ class Contract:
         if type(version) is not int or version != CONTRACT_VERSION:
             expected = f"expected {CONTRACT_VERSION}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
-        values = {one.name: _value(metadata, one.name) for one in fields(cls) if one.name not in _LATER}
+        values = {key.name: _value(metadata, key.name) for key in fields(cls) if key.name not in _LATER}
         values |= {name: _value(metadata, name) for name in _LATER if KEY_PREFIX + name in metadata}
         _check(values)
         values["counts_per_unit"] = tuple(values["counts_per_unit"])
@@ -219,9 +219,9 @@ class Contract:
 
         Where it has an interval, the whole interval must be. Of a model for one sensor any other pad is outside.
         """
-        known = {} if pad is None else pad.constants | {GAINS_CERTAINTY: pad.gains_certainty}
+        constants = {} if pad is None else pad.constants | {GAINS_CERTAINTY: pad.gains_certainty}
         for name, (least, most) in self.made_for.items():
-            low, high = (known.get(name, math.nan),) * 2
+            low, high = (constants.get(name, math.nan),) * 2
             if pad is not None and name in pad.intervals:
                 low, high = pad.intervals[name]
             if not (low <= most and high >= least):
@@ -287,9 +287,9 @@ def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
     yield "confidence", is_confidence(values["confidence"], values["taps"]), tables
     is_levels = is_interval_levels(values["interval_levels"])
     yield "interval_levels", is_levels, "for each percentage a positive number for every region"
-    scaling = values["counts_per_unit"]
-    is_scaling = isinstance(scaling, list) and len(scaling) == 3 and all(_is_from(LEAST_UNIT, one) for one in scaling)
-    yield "counts_per_unit", is_scaling, f"three positive numbers from {LEAST_UNIT:g}, for x, y, z"
+    units = values["counts_per_unit"]
+    is_units = isinstance(units, list) and len(units) == 3 and all(_is_from(LEAST_UNIT, unit) for unit in units)
+    yield "counts_per_unit", is_units, f"three positive numbers from {LEAST_UNIT:g}, for x, y, z"
     for key in ("output_unit", "sensor", "training_sha256", "test_set_sha256"):
         text = values[key]
         is_text = isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_SHOWN

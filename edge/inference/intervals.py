@@ -65,20 +65,20 @@ def _is_percent(key: str) -> bool:
 def _is_factors(row: Any) -> bool:
     if not isinstance(row, list) or len(row) != len(REGIONS):
         return False
-    return all(type(one) in (int, float) and 0 < one <= 1e6 for one in row)
+    return all(type(factor) in (int, float) and 0 < factor <= 1e6 for factor in row)
 
 
 def _grown(masks: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     """Return masks (n, H, W) grown by so many pixels along both axes and all diagonals."""
     grown = masks
     for axis in (1, 2):
-        one = grown.copy()
+        wider = grown.copy()
         for step in range(1, by + 1):
             before, after = [slice(None)] * 3, [slice(None)] * 3
             before[axis], after[axis] = slice(step, None), slice(None, -step)
-            one[tuple(before)] |= grown[tuple(after)]
-            one[tuple(after)] |= grown[tuple(before)]
-        grown = one
+            wider[tuple(before)] |= grown[tuple(after)]
+            wider[tuple(after)] |= grown[tuple(before)]
+        grown = wider
     return grown
 
 

@@ -195,8 +195,8 @@ class ModelSession:
         try:
             if count == 1 or self.contract.batch == ANY_BATCH:
                 return run(self._names, feeds, self._options)
-            single = ({name: one[index : index + 1] for name, one in feeds.items()} for index in range(count))
-            parts = [run(self._names, one, self._options) for one in single]
+            single = ({name: values[index : index + 1] for name, values in feeds.items()} for index in range(count))
+            parts = [run(self._names, feed, self._options) for feed in single]
         except ORT_ERRORS as error:
             raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
         return list(map(np.concatenate, zip(*parts, strict=True)))

@@ -166,7 +166,7 @@ class ForwardModel:
 
     def to_json(self) -> dict[str, Any]:
         """Return the model as JSON."""
-        return {one.name: packed(getattr(self, one.name)) for one in fields(self)}
+        return {field.name: packed(getattr(self, field.name)) for field in fields(self)}
 
 
 def forward_model(value: Any, constants: int) -> ForwardModel:
@@ -175,7 +175,7 @@ def forward_model(value: Any, constants: int) -> ForwardModel:
     Raises:
         ValueError: it is none, or of other constants.
     """
-    names = [one.name for one in fields(ForwardModel)]
+    names = [field.name for field in fields(ForwardModel)]
     if not isinstance(value, dict) or set(value) != set(names):
         raise ValueError(f"expected {', '.join(names)}")
     arrays = {name: unpacked(value[name]) for name in names}

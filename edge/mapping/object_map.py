@@ -235,7 +235,7 @@ class ObjectMap:
             raise UsageError(f"the model's patterns are in {result.pattern_unit}, expected mm: choose another model")
         self._checks = self._checks or result.trusted is not None
         before, press = self._presses.get(sensor), _Press(pose, pose, result)
-        if before is not None and _apart_mm(before.origin, pose) < STEP_MM:
+        if before is not None and _distance_mm(before.origin, pose) < STEP_MM:
             if press.rank > before.rank:
                 before.pose, before.result = pose, result
             return
@@ -317,8 +317,8 @@ class ObjectMap:
             return -top_mm  # its top is taken to be as high as the first press's, which is 0
         information, there = seen[both, 2], before[both]
         weight = information * there[:, 2] / (information + there[:, 2])
-        apart_mm = there[:, 3] / there[:, 2] - seen[both, 3] / information
-        return float(weight @ apart_mm / weight.sum())
+        offsets_mm = there[:, 3] / there[:, 2] - seen[both, 3] / information
+        return float(weight @ offsets_mm / weight.sum())
 
     def _worth(self, pose: PadPose) -> float:
         """Return how many taps a pattern is worth beside those before: a whole one a pitch away, under other taxels.
@@ -341,7 +341,7 @@ def _contact(covered: NDArray[np.float32], odds: NDArray[np.float32]) -> NDArray
     return np.divide(1, 1 + np.exp(-odds), out=nothing, where=covered > 0)
 
 
-def _apart_mm(one: PadPose, other: PadPose) -> float:
+def _distance_mm(pose: PadPose, other: PadPose) -> float:
     """Return how far the points of a pad move between two poses, at the root of their mean square."""
-    turned_mm = _RADIUS_MM * 2 * sin(radians(one.turn_deg - other.turn_deg) / 2)
-    return hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm, turned_mm)
+    turned_mm = _RADIUS_MM * 2 * sin(radians(pose.turn_deg - other.turn_deg) / 2)
+    return hypot(pose.x_mm - other.x_mm, pose.y_mm - other.y_mm, turned_mm)

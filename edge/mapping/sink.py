@@ -250,9 +250,9 @@ def _emulated_line(width: int) -> NDArray[np.uint8]:
 def _coloured(shares: NDArray[np.floating], doubted: NDArray[np.bool_]) -> NDArray[np.uint8]:
     from edge.terminal.heatmap import colours  # not loaded by a run without a picture
 
-    known = np.isfinite(shares)
-    pixels = colours(np.where(known, shares, 0)).astype(np.uint8)
-    pixels[~known] = 255
+    covered = np.isfinite(shares)
+    pixels = colours(np.where(covered, shares, 0)).astype(np.uint8)
+    pixels[~covered] = 255
     pixels[doubted] = (200, 40, 30)
     return pixels
 

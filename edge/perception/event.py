@@ -169,8 +169,8 @@ def notes_on_missing(sensor: str, mounted: Collection[str], zeroed: Collection[s
     """Return notes on what is stored for other sensors, `mounted` or `zeroed`, but not for this one."""
     notes: list[Note] = []
     if mounted and sensor not in mounted:
-        known = ", ".join(sorted(mounted))
-        text = f"the sensor file has no sensor {sensor}, only {known}: taken as wired"
+        others = ", ".join(sorted(mounted))
+        text = f"the sensor file has no sensor {sensor}, only {others}: taken as wired"
         notes.append(Note("not_in_sensor_file", text))
     if zeroed and sensor not in zeroed:
         text = f"no stored baseline for sensor {sensor}, only for {', '.join(sorted(zeroed))}: zeroing"

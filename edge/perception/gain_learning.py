@@ -149,7 +149,7 @@ class GainLearner:
         """Gains (GAINS,) so far, within BOUND of 1."""
         # Weight of the contacts beside the beginning, over what it is where nothing is known at the beginning.
         information = (1 / self._after - 1 / self._before).clip(0)
-        weight, of_unknown = ((information / (information + 1 / one)).sum() for one in (self._before, self._unknown))
+        weight, of_unknown = ((information / (information + 1 / var)).sum() for var in (self._before, self._unknown))
         biased = self._count / (self._count + 30) * weight / max(of_unknown, 1e-9)
         return (np.exp(-biased * self._model.bias) / self._best[:GAINS]).clip(1 - BOUND, 1 + BOUND)
 
@@ -162,7 +162,7 @@ class GainLearner:
             name, middle, spread = self._model.constants[at]
             if name in PAD_RANGES:
                 ends = self.constants[at] + LEVEL_90 * self.constant_deviations[at] * np.array([-1, 0, 1])
-                low, constants[name], high = (float(f"{middle + spread * one:.4g}") for one in ends.clip(-1, 1))
+                low, constants[name], high = (float(f"{middle + spread * end:.4g}") for end in ends.clip(-1, 1))
                 intervals[name] = (low, high)
         gains = tuple(self.gains.round(4).tolist())
         return Pad(**constants, intervals=intervals, gains=gains, gain_half_widths=tuple(half.round(4).tolist()))

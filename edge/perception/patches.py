@@ -55,9 +55,9 @@ def patches(result: Result, contract: Contract) -> list[Patch]:
     pattern, pixel_mm = result.pattern, contract.pitch_mm / contract.scale
     labels, count = _labelled(touched(pattern, contract.contact_level))
     volume = np.bincount(labels.ravel(), pattern.ravel(), count + 1)[1:]
-    kept = [int(one) + 1 for one in np.argsort(-volume) if volume[one] >= 0.05 * volume.sum()]
-    forces = _forces(result, [pattern * (labels == one) for one in kept], contract)
-    return [_patch(pattern, labels == one, pixel_mm, force, result) for one, force in zip(kept, forces, strict=True)]
+    masks = [labels == index + 1 for index in np.argsort(-volume) if volume[index] >= 0.05 * volume.sum()]
+    forces = _forces(result, [pattern * mask for mask in masks], contract)
+    return [_patch(pattern, mask, pixel_mm, force, result) for mask, force in zip(masks, forces, strict=True)]
 
 
 def _patch(
@@ -101,10 +101,10 @@ def _forces(
     if result.traction is None or not parts:
         return [None] * len(parts)
     height, width = result.traction.shape[1:]
-    blocks = np.stack([one.reshape(height, len(one) // height, width, -1).sum(axis=(1, 3)) for one in parts])
+    blocks = np.stack([part.reshape(height, len(part) // height, width, -1).sum(axis=(1, 3)) for part in parts])
     everywhere = blocks.sum(axis=0)
     places = np.indices((height, width))
-    centres = [(places * one).sum(axis=(1, 2), keepdims=True) / one.sum() for one in blocks]
+    centres = [(places * block).sum(axis=(1, 2), keepdims=True) / block.sum() for block in blocks]
     nearest = np.argmin([((places - centre) ** 2).sum(axis=0) for centre in centres], axis=0)
     alone = np.arange(len(parts))[:, None, None] == nearest
     shares = np.divide(blocks, everywhere, out=alone.astype(blocks.dtype), where=everywhere > 0)
@@ -153,7 +153,7 @@ class PatchEvents:
     """Follower of one sensor's contacts from result to result.
 
     A contact begins once it was there for `scans` results in a row, and ends once it was missing for as many; it moves
-    by `move_mm` from where it was when that was last told; it slips where its shear over its normal force reaches
+    by `move_mm` from where it was when that was last reported; it slips where its shear over its normal force reaches
     `slip_ratio`, and again only after it has fallen to four fifths of it. Patterns that are not believed count for
     nothing.
     """
@@ -178,39 +178,39 @@ class PatchEvents:
             return []
         free = patches(result, self._contract)
         events: list[PatchEvent] = []
-        for one in self._followed:
-            near = min(free, key=one.distance_mm, default=None)
-            if near is None or one.distance_mm(near) > self._reach_mm:
-                one.missing += 1
+        for contact in self._followed:
+            near = min(free, key=contact.distance_mm, default=None)
+            if near is None or contact.distance_mm(near) > self._reach_mm:
+                contact.missing += 1
                 continue
             free.remove(near)
-            one.patch, one.seen, one.missing = near, one.seen + 1, 0
-            events += self._told(one)
-        events += [
-            PatchEvent("end", one.number, one.patch) for one in self._followed if self._is_over(one) and one.number
-        ]
-        self._followed = [one for one in self._followed if not self._is_over(one)] + [_Followed(new) for new in free]
+            contact.patch, contact.seen, contact.missing = near, contact.seen + 1, 0
+            events += self._changes(contact)
+        over = [contact for contact in self._followed if self._is_over(contact)]
+        events += [PatchEvent("end", contact.number, contact.patch) for contact in over if contact.number]
+        going_on = [contact for contact in self._followed if not self._is_over(contact)]
+        self._followed = going_on + [_Followed(patch) for patch in free]
         return events
 
-    def _is_over(self, one: "_Followed") -> bool:
-        return one.missing >= (self._scans if one.number else 1)
+    def _is_over(self, contact: "_Followed") -> bool:
+        return contact.missing >= (self._scans if contact.number else 1)
 
-    def _told(self, one: "_Followed") -> Iterator[PatchEvent]:
-        if not one.number and one.seen >= self._scans:
+    def _changes(self, contact: "_Followed") -> Iterator[PatchEvent]:
+        if not contact.number and contact.seen >= self._scans:
             self._begun += 1
-            one.number, one.told_mm = self._begun, one.patch.centre_mm
-            yield PatchEvent("begin", one.number, one.patch)
-        if not one.number:
+            contact.number, contact.reported_mm = self._begun, contact.patch.centre_mm
+            yield PatchEvent("begin", contact.number, contact.patch)
+        if not contact.number:
             return
-        if math.dist(one.told_mm, one.patch.centre_mm) >= self._move_mm:
-            one.told_mm = one.patch.centre_mm
-            yield PatchEvent("move", one.number, one.patch)
-        ratio = one.patch.shear_ratio
-        if ratio is not None and not one.slipping and ratio >= self._slip_ratio:
-            one.slipping = True
-            yield PatchEvent("slip", one.number, one.patch)
+        if math.dist(contact.reported_mm, contact.patch.centre_mm) >= self._move_mm:
+            contact.reported_mm = contact.patch.centre_mm
+            yield PatchEvent("move", contact.number, contact.patch)
+        ratio = contact.patch.shear_ratio
+        if ratio is not None and not contact.slipping and ratio >= self._slip_ratio:
+            contact.slipping = True
+            yield PatchEvent("slip", contact.number, contact.patch)
         elif ratio is not None and ratio <= 0.8 * self._slip_ratio:
-            one.slipping = False
+            contact.slipping = False
 
 
 @dataclass
@@ -221,7 +221,7 @@ class _Followed:
     number: int = 0
     seen: int = 1
     missing: int = 0
-    told_mm: tuple[float, float] = (0.0, 0.0)
+    reported_mm: tuple[float, float] = (0.0, 0.0)
     slipping: bool = False
 
     def distance_mm(self, other: Patch) -> float:

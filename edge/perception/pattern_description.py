@@ -39,11 +39,11 @@ def _sums(height: int, width: int, pixel_mm: float) -> NDArray[np.float64]:
     """Return the matrix (6, 3 h w) that maps a flat traction to force and torque."""
     y_mm, x_mm = np.indices((height, width), dtype=np.float64).reshape(2, -1)
     x_mm, y_mm = (x_mm - (width - 1) / 2) * pixel_mm, (y_mm - (height - 1) / 2) * pixel_mm
-    one, none = np.ones_like(x_mm), np.zeros_like(x_mm)
+    ones, zeros = np.ones_like(x_mm), np.zeros_like(x_mm)
     rows = (
-        *((one, none, none), (none, one, none), (none, none, one)),
+        *((ones, zeros, zeros), (zeros, ones, zeros), (zeros, zeros, ones)),
         # (x, y, 0) cross (x, y, z of the traction)
-        *((none, none, y_mm), (none, none, -x_mm), (-y_mm, x_mm, none)),
+        *((zeros, zeros, y_mm), (zeros, zeros, -x_mm), (-y_mm, x_mm, zeros)),
     )
     return np.array([np.concatenate(row) for row in rows]) * (_N_OF_KPA_MM2 * pixel_mm**2)
 
@@ -101,12 +101,12 @@ class Balance:
         # The same over all contacts: of the network's shear, over that by nominal counts per newton.
         x_per_n, y_per_n = self._counts_per_n
         shear_x, shear_y = (x - z * by_x / squares) / x_per_n, (y - z * by_y / squares) / y_per_n
-        nominal, found = self._shear
+        nominal, inferred = self._shear
         nominal += shear_x * shear_x + shear_y * shear_y
-        found += shear_x * x_n + shear_y * y_n
-        self._shear = nominal, found
+        inferred += shear_x * x_n + shear_y * y_n
+        self._shear = nominal, inferred
         # Newtons for a nominal one, 0.62 to 2.96 on 2000 drawn pads: an offset of x or y, as of a cable, is no more.
-        scale = min(max(found / nominal, 0.5), 3.0)
+        scale = min(max(inferred / nominal, 0.5), 3.0)
         # Shear that the network has not found, or too much of it, lies where the pad is pressed.
         more_x, more_y = (scale * shear_x - x_n) / z_n, (scale * shear_y - y_n) / z_n
         mixed = np.array([(1, 0, more_x), (0, 1, more_y), (0, 0, z * by_force / squares / z_n)], dtype=np.float32)

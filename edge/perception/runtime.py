@@ -286,7 +286,7 @@ class Runtime:
 
     def take_learned(self) -> dict[str, Pad]:
         """Return the pads with gains learned since the last call, by sensor name."""
-        learned = {name: one.learn.take_learned() for name, one in self._sensors.items() if one.learn is not None}
+        learned = {name: sensor.learn.take_learned() for name, sensor in self._sensors.items() if sensor.learn}
         return {name: pad for name, pad in learned.items() if pad is not None}
 
     def reset(self) -> None:
@@ -301,11 +301,11 @@ class Runtime:
         The old baselines stay in use until then.
         """
         chosen = list(self._sensors) if name is None else [name] if name in self._sensors else []
-        for one in chosen:
-            self._sensors[one].zero_again(force=force)
+        for sensor in chosen:
+            self._sensors[sensor].zero_again(force=force)
         if not chosen:
-            known = ", ".join(sorted(self._sensors))
-            why = f"no sensor {name}, there are {known}" if known else "no scan has arrived yet"
+            sensors = ", ".join(sorted(self._sensors))
+            why = f"no sensor {name}, there are {sensors}" if sensors else "no scan has arrived yet"
             self._events.append(Untimed("refused", None, f"zeroing refused: {why}"))
 
     def pose(self, pose: PadPose, time_ns: int, sensor: str | None = None, *, holds: bool = False) -> bool:

@@ -38,13 +38,13 @@ class TapPoses:
 
         A pose may come later than its scan, and a track is short, so that every scan looks for what is missing.
         """
-        known = self._poses
+        poses = self._poses
         for peak in tap.peaks:
-            if peak.tap not in known and (pose := track.at(peak.time_ns)) is not None:
-                known[peak.tap] = pose
-        if max(len(known), len(self._reported) - 1) > len(tap.peaks):
+            if peak.tap not in poses and (pose := track.at(peak.time_ns)) is not None:
+                poses[peak.tap] = pose
+        if max(len(poses), len(self._reported) - 1) > len(tap.peaks):
             remembered = {peak.tap for peak in tap.peaks}
-            self._poses = {number: pose for number, pose in known.items() if number in remembered}
+            self._poses = {number: pose for number, pose in poses.items() if number in remembered}
             self._reported &= remembered | {tap.tap}
 
     def choose(
@@ -73,16 +73,16 @@ class TapPoses:
                 continue
             # The error of a taxel is the same in all taps at one place, and the model takes it for seen several times:
             # on real grips such taps made five times as many holes as one alone (docs/decisions.md).
-            if any(self._apart_mm(earlier, other) < 0.5 for other in poses):
+            if any(self._distance_mm(earlier, other) < 0.5 for other in poses):
                 continue
             slots.append(slot)
             poses.append(earlier)
         return slots, pose_rows(poses)
 
-    def _apart_mm(self, one: PadPose, other: PadPose) -> float:
+    def _distance_mm(self, pose: PadPose, other: PadPose) -> float:
         """Return the distance between two pads, root mean square over their taxels, in [mm], for small turns."""
-        turned_mm = self._radius_mm * radians(abs((one.turn_deg - other.turn_deg + 180) % 360 - 180))
-        return hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm, turned_mm)
+        turned_mm = self._radius_mm * radians(abs((pose.turn_deg - other.turn_deg + 180) % 360 - 180))
+        return hypot(pose.x_mm - other.x_mm, pose.y_mm - other.y_mm, turned_mm)
 
     def _leave_out(self, tap: int, kind: EventKind, why: str) -> None:
         if tap not in self._reported:
@@ -142,8 +142,8 @@ def next_shift_mm(places_mm: NDArray[np.floating], reach_mm: float) -> tuple[flo
     Places (K, 2) of the taps so far are in the newest one's axes, and the next one must not be further than the reach
     from any of them; None where each place was touched or is out of reach.
     """
-    apart_mm = np.hypot(*(_SHIFTS_MM[:, None] - places_mm).transpose(2, 0, 1))
-    free = (apart_mm > _HALF_PITCH_MM / 2).all(axis=1) & (apart_mm <= reach_mm).all(axis=1)
+    distances_mm = np.hypot(*(_SHIFTS_MM[:, None] - places_mm).transpose(2, 0, 1))
+    free = (distances_mm > _HALF_PITCH_MM / 2).all(axis=1) & (distances_mm <= reach_mm).all(axis=1)
     if not free.any():
         return None
     from_middle_mm = np.hypot(*(_SHIFTS_MM - places_mm.mean(axis=0)).T)

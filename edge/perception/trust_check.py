@@ -147,8 +147,8 @@ def foreign_taps(belonging: Sequence[float], *, posed: bool) -> list[int]:
 
     A tap with a pose of its own goes alone. Without poses the taps before it go, too: their turns are counted over it.
     """
-    found = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
-    return found if posed or not found else list(range(found[0], len(belonging) + 1))
+    foreign = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
+    return foreign if posed or not foreign else list(range(foreign[0], len(belonging) + 1))
 
 
 def _alternates(z: NDArray[np.float32]) -> bool:
@@ -193,16 +193,16 @@ class Check:
         belonging = tuple(self._check.belonging(scaled, window.taps, window.poses))
         posed = step.pose is not None
         dropped = foreign_taps(belonging, posed=posed)
-        settled = [
+        forgotten = [
             number
             for number in (dropped if posed else dropped[:1])
             if scaled[0, 2].sum() >= 0.85 * scaled[number, 2].sum()
         ]
-        for number in settled:
+        for number in forgotten:
             self._report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")
-        if settled:
+        if forgotten:
             slots = window.slots
-            self._taps.forget([slots[one] for one in settled] if posed else range(slots[settled[0]], sys.maxsize))
+            self._taps.forget([slots[tap] for tap in forgotten] if posed else range(slots[forgotten[0]], sys.maxsize))
         return [number for number in every if number not in dropped], belonging
 
     def __call__(

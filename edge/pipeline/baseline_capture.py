@@ -52,25 +52,25 @@ def take_baselines(
             if taken is None:
                 raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor")
             now_s = clock_s()
-            if any(isinstance(one, Scan) for one in taken):
+            if any(isinstance(arrival, Scan) for arrival in taken):
                 received_s = now_s
             elif now_s - received_s > GIVEN_UP_S:
                 hint = silence_hint((), source.counters)
                 raise DeviceError(f"no scan from {source.name} for {GIVEN_UP_S:.0f} s: {hint}")
-            for one in taken:
-                if not isinstance(one, Scan):
-                    if isinstance(one, Notice) and one.kind in ("lost", "silent"):
+            for arrival in taken:
+                if not isinstance(arrival, Scan):
+                    if isinstance(arrival, Notice) and arrival.kind in ("lost", "silent"):
                         estimators.clear()  # the sensor may read differently after the gap
                     continue
-                name = one.sensor
+                name = arrival.sensor
                 skipped[name] = skipped.get(name, -1) + 1
-                if name not in whole_s or (one.complete and not one.repeated):
+                if name not in whole_s or (arrival.complete and not arrival.repeated):
                     whole_s[name] = now_s
                 if skipped[name] < skip or name in baselines:
                     continue
                 estimator = estimators.setdefault(name, BaselineEstimator(scans, clock=clock))
                 try:
-                    baseline = estimator.push(one)
+                    baseline = estimator.push(arrival)
                 except BaselineRefusedError as refusal:
                     raise BaselineRefusedError(f"sensor {name}: {refusal}") from refusal
                 if baseline is not None:

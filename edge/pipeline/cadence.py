@@ -49,7 +49,7 @@ class Cadence:
         self.last: Scan | None = None
         self.missed = self.since_ns = 0
         self.silent = False
-        self.period_ns = self._known_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
+        self.period_ns = self._stated_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
         self._intervals: deque[int] = deque(maxlen=31)
         self._hurried = 0
         self._forget_pace(None)
@@ -80,11 +80,11 @@ class Cadence:
         self._hurried = self._hurried + 1 if hurried else 0
         if self._hurried > LONGEST_BURST:
             self._intervals.clear()
-            self.period_ns = self._known_ns
+            self.period_ns = self._stated_ns
         elif hurried:
             return
         self._intervals.append(interval_ns)
-        if self._known_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
+        if self._stated_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
             self.period_ns = sorted(self._intervals)[len(self._intervals) // 2]
 
     def _forget_pace(self, scan: Scan | None) -> None:

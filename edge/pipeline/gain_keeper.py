@@ -47,14 +47,14 @@ def keep_learned(path: Path, sensor: str, learned: Pad, *, emulated: bool = Fals
         SensorFileError: the file cannot be read or written.
     """
     with changing(path):
-        known = load_sensor_file(path)
-        entry = known.sensors.get(sensor, SensorEntry(assumed=frozenset({"mounting"})))
+        file = load_sensor_file(path)
+        entry = file.sensors.get(sensor, SensorEntry(assumed=frozenset({"mounting"})))
         before = entry.learned
         surer = before is not None and before.gains_certainty > learned.gains_certainty
         if surer or (emulated and not entry.emulated):
             return
         entry = replace(entry, learned=learned)
-        save_sensor_file(path, replace(known, sensors=dict(known.sensors) | {sensor: entry}), keep_before=False)
+        save_sensor_file(path, replace(file, sensors=dict(file.sensors) | {sensor: entry}), keep_before=False)
 
 
 def forget_learned(path: Path, sensor: str) -> None:
@@ -64,9 +64,9 @@ def forget_learned(path: Path, sensor: str) -> None:
         SensorFileError: the file has none, or cannot be read or written.
     """
     with changing(path):
-        known = load_sensor_file(path)
-        entry = known.sensors.get(sensor)
+        file = load_sensor_file(path)
+        entry = file.sensors.get(sensor)
         if entry is None or entry.learned is None:
-            there = ", ".join(name for name, one in known.sensors.items() if one.learned is not None) or "of no sensor"
+            there = ", ".join(name for name, kept in file.sensors.items() if kept.learned is not None) or "of no sensor"
             raise SensorFileError(f"{path}: no learned gains of sensor {sensor}, expected one that has them: {there}")
-        save_sensor_file(path, replace(known, sensors=dict(known.sensors) | {sensor: replace(entry, learned=None)}))
+        save_sensor_file(path, replace(file, sensors=dict(file.sensors) | {sensor: replace(entry, learned=None)}))

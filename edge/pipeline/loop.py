@@ -191,25 +191,25 @@ class Loop:
             self._tell_refusal(self._commands.reason)
         if self._poses.begun or source.states_poses:
             self._take_poses(taken)
-        for one in taken:
-            if isinstance(one, Scan):
-                for result in runtime.take(one, self._latency_clock):
+        for arrival in taken:
+            if isinstance(arrival, Scan):
+                for result in runtime.take(arrival, self._latency_clock):
                     self._follow(result)
-                if one.time_ns < self._cadences.waited_ns:
+                if arrival.time_ns < self._cadences.waited_ns:
                     self._make_patterns()
-            elif isinstance(one, Notice):
+            elif isinstance(arrival, Notice):
                 self._make_patterns()
-                self._take_notice(one)
+                self._take_notice(arrival)
         if not taken:
             self._rest(wait_s)
         return True
 
     def _is_too_long(self, taken: Sequence[Scan | Notice | TimedPose]) -> bool:
         """Return whether the time of a patient source, which is that of its scans, is over."""
-        for one in taken:
-            if isinstance(one, Scan):
-                self._now_ns = one.time_ns
-                self._first_ns = one.time_ns if self._first_ns is None else self._first_ns
+        for arrival in taken:
+            if isinstance(arrival, Scan):
+                self._now_ns = arrival.time_ns
+                self._first_ns = arrival.time_ns if self._first_ns is None else self._first_ns
         return self._first_ns is not None and self._now_ns - self._first_ns >= self._length_ns
 
     def _finish(self) -> None:
@@ -254,8 +254,8 @@ class Loop:
 
     def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose]) -> None:
         """Pass poses on to the runtime: those from outside, and those of the source."""
-        recorded = [one for one in taken if isinstance(one, TimedPose)]
-        first_ns = min((one.time_ns for one in taken if isinstance(one, Scan)), default=None)
+        recorded = [pose for pose in taken if isinstance(pose, TimedPose)]
+        first_ns = min((scan.time_ns for scan in taken if isinstance(scan, Scan)), default=None)
         now_ns = self._now_ns if self._source.patient else self._clock_ns()
         poses = self._intake.take(recorded, first_ns, now_ns, self._no_sensor)
         for sink in self._sinks if poses else ():

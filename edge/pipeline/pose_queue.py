@@ -49,10 +49,10 @@ def pose_of_fields(fields: Mapping[str, Any], now_ns: int) -> TimedPose:
     """
     errors = {"error_mm": PLACE_ERROR_MM, "error_deg": TURN_ERROR_DEG}
     numbers = {"x_mm": None, "y_mm": None, "turn_deg": 0.0} | errors
-    known = {"cmd": "pose", **numbers, "sensor": None, "time_ns": now_ns, "holds": False}
-    given = {**known, **fields}
-    if unknown := sorted(map(str, given.keys() - known.keys())):
-        raise PoseError("unknown", f"it has {_shown(unknown[0])}, expected some of {', '.join(known)}")
+    defaults = {"cmd": "pose", **numbers, "sensor": None, "time_ns": now_ns, "holds": False}
+    given = {**defaults, **fields}
+    if unknown := sorted(map(str, given.keys() - defaults.keys())):
+        raise PoseError("unknown", f"it has {_shown(unknown[0])}, expected some of {', '.join(defaults)}")
     values: dict[str, Any] = {name: as_float(given[name]) for name in numbers}
     sensor, time_ns, holds = given["sensor"], given["time_ns"], given["holds"]
     is_name = sensor is None or (isinstance(sensor, str) and is_sensor_name(sensor))

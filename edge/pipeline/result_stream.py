@@ -274,10 +274,10 @@ class Together(tuple[Result, ...]):
         zero or its scale, or something else bears on what is gripped. None unless both pads are touched and their
         baselines not in doubt.
         """
-        if len(self) != 2 or not all(one.contact for one in self):
+        if len(self) != 2 or not all(result.contact for result in self):
             return None
-        newtons = [one.force_n for one in self]
-        forces = [one.force_counts for one in self] if None in newtons else newtons
+        newtons = [result.force_n for result in self]
+        forces = [result.force_counts for result in self] if None in newtons else newtons
         first, second = (0.0 if force is None else force for force in forces)
         return 2 * (first - second) / (first + second) if first > 0 and second > 0 else None
 

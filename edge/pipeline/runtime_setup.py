@@ -78,19 +78,19 @@ def open_runtime(
             the model takes.
     """
     chosen = RuntimeOptions(**options)
-    known, nominal = source.sensor_file, source.sensor_file.geometry == USPA44
+    sensor_file, nominal = source.sensor_file, source.sensor_file.geometry == USPA44
     return Runtime(
         load_model(model) if isinstance(model, (str, Path)) else model,
         source=source.kind,
         estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)) if nominal else None,
         contacts=load_contact_model() if nominal and chosen.learn else None,
-        geometry=known.geometry,
-        baselines=of_single_csv(stored_baselines(baselines, known), source.name),
-        counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
-        scale_intervals=known.scale_intervals if counts_per_newton is None else None,
-        mountings=known.mountings,
-        pad=known.pads if pad is None else pad,
-        measured=known.measured_pads if pad is None else None,
+        geometry=sensor_file.geometry,
+        baselines=of_single_csv(stored_baselines(baselines, sensor_file), source.name),
+        counts_per_newton=(sensor_file.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
+        scale_intervals=sensor_file.scale_intervals if counts_per_newton is None else None,
+        mountings=sensor_file.mountings,
+        pad=sensor_file.pads if pad is None else pad,
+        measured=sensor_file.measured_pads if pad is None else None,
         options=chosen,
         unix_time_s=source.unix_time_s,
     )
@@ -123,9 +123,9 @@ def infer(
     if not isinstance(baseline, Baseline):
         baseline = Baseline.from_counts("array", _checked("baseline", baseline, lowest=0), 0.0)
     recording = Recording(Path("array"), (Track(baseline.sensor, scans, None),), rate_hz)
-    known = sensor_settings(None, unmapped(pad_of(*scans.shape[2:])))
-    known = replace(known, sensors={baseline.sensor: SensorEntry(baseline=baseline)})
-    with Source(ReplayLink([recording], paced=False), sensor_file=known) as source:
+    sensor_file = sensor_settings(None, unmapped(pad_of(*scans.shape[2:])))
+    sensor_file = replace(sensor_file, sensors={baseline.sensor: SensorEntry(baseline=baseline)})
+    with Source(ReplayLink([recording], paced=False), sensor_file=sensor_file) as source:
         return list(Stream(source, open_runtime(model, source)))
 
 

@@ -145,11 +145,11 @@ _REQUEST: Final = struct.Struct("16s4x4s232x")
 
 def own_addresses() -> list[str]:
     """Return the IPv4 addresses of this machine at which others on its networks reach it."""
-    found: list[str] = []
+    addresses: list[str] = []
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         for _, name in socket.if_nameindex():
             with suppress(OSError):  # SIOCGIFADDR of an interface without an IPv4 address
                 answer = ioctl(asked, 0x8915, _REQUEST.pack(name.encode(), bytes(4)))
-                found.append(socket.inet_ntoa(_REQUEST.unpack(answer)[1]))
-    usable = (one for one in map(ipaddress.ip_address, found) if not (one.is_loopback or one.is_link_local))
+                addresses.append(socket.inet_ntoa(_REQUEST.unpack(answer)[1]))
+    usable = (ip for ip in map(ipaddress.ip_address, addresses) if not (ip.is_loopback or ip.is_link_local))
     return list(dict.fromkeys(map(str, usable)))

@@ -128,7 +128,7 @@ class RunSnapshot(Sink):
 
     def events(self, since: int) -> list[NumberedEvent]:
         """Return the latest events after number `since`."""
-        return [one for one in self._events.copy() if one.number > since]
+        return [event for event in self._events.copy() if event.number > since]
 
     def points(self, sensor: str, since: int) -> list[Point]:
         """Return the points of a sensor after number `since`: all, or if these are too many, one in 50 ms."""

@@ -105,13 +105,13 @@ class EmulatorThread:
 
     def __init__(self, emulators: Sequence[Playing]) -> None:
         """Prepare to play them; nothing is plugged in yet."""
-        self._courses = {one: one.course() for one in emulators}
+        self._courses = {emulator: emulator.course() for emulator in emulators}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._play, name="emulator", daemon=True)
 
     def __enter__(self) -> Self:
-        for one in self._courses:
-            one.plug()
+        for emulator in self._courses:
+            emulator.plug()
         self._thread.start()
         return self
 
@@ -121,20 +121,20 @@ class EmulatorThread:
 
     def _play(self) -> None:
         try:
-            due_s = {one: next(course) for one, course in self._courses.items()}
+            due_s = {emulator: next(course) for emulator, course in self._courses.items()}
             while due_s and not self._stop.is_set():
                 left_s = min(due_s.values()) - time.monotonic()
-                received = listen([one.line for one in due_s], min(max(left_s, 0.0), 0.05))
+                received = listen([emulator.line for emulator in due_s], min(max(left_s, 0.0), 0.05))
                 now_s = time.monotonic()
-                for one in list(due_s):
-                    if data := received.get(one.line):
-                        one.obey(data)
-                    if data or due_s[one] <= now_s:
-                        next_s = next(self._courses[one], None)
+                for emulator in list(due_s):
+                    if data := received.get(emulator.line):
+                        emulator.obey(data)
+                    if data or due_s[emulator] <= now_s:
+                        next_s = next(self._courses[emulator], None)
                         if next_s is None:
-                            del due_s[one]
+                            del due_s[emulator]
                         else:
-                            due_s[one] = next_s
+                            due_s[emulator] = next_s
         finally:
             for course in self._courses.values():
                 course.close()

@@ -73,8 +73,8 @@ def controllers_of(recordings: Sequence[Recording], rate_hz: float | None) -> li
     for number, (recording, track) in enumerate(tracks):
         model = ID_MAPS.get(track.geometry.name)
         if model is None:
-            known = ", ".join(dict.fromkeys(str(model.geometry.scan_shape) for model in ID_MAPS.values()))
-            raise RecordingError(f"{recording.path}: scans of shape {track.counts.shape[1:]}, expected one of {known}")
+            shapes = ", ".join(dict.fromkeys(str(model.geometry.scan_shape) for model in ID_MAPS.values()))
+            raise RecordingError(f"{recording.path}: scans of shape {track.counts.shape[1:]}, expected one of {shapes}")
         controllers.append(Controller(track, 4 + 2 * number, playing_rate_hz(recording, track, rate_hz), model))
     return controllers
 
@@ -84,12 +84,12 @@ def playing_rate_hz(recording: Recording, track: Track, rate_hz: float | None) -
 
     It raises ValueError unless that is positive, and RecordingError where none is recorded.
     """
-    known_hz = [one for one in (rate_hz, recording.rate_hz, track.mean_rate_hz) if one is not None]
-    if not known_hz:
+    rates_hz = [rate for rate in (rate_hz, recording.rate_hz, track.mean_rate_hz) if rate is not None]
+    if not rates_hz:
         raise RecordingError(f"{recording.path} does not state its rate: pass --rate-hz")
-    if not 0 < known_hz[0] < math.inf:
-        raise ValueError(f"rate is {known_hz[0]} Hz, expected a positive number")
-    return known_hz[0]
+    if not 0 < rates_hz[0] < math.inf:
+        raise ValueError(f"rate is {rates_hz[0]} Hz, expected a positive number")
+    return rates_hz[0]
 
 
 def bus_timeline(
@@ -241,7 +241,7 @@ class Emulator:
         self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, played=played)
         self._frame_s = frame_s
         self._on_scan = on_scan
-        self._last_frames = {one.model.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
+        self._last_frames = {sensor.model.wire_order(str(sensor.can_id))[-1][0]: sensor.can_id for sensor in bus}
         self._waits = waits
         self._still_s = 0.0
         self._unsent = b""

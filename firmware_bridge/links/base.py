@@ -152,7 +152,7 @@ class Unread:
         self.empty_ns: int | None = None
         self._stall_ns = 0, 0
 
-    def found(self, begun_ns: int, ended_ns: int) -> None:
+    def note_data(self, begun_ns: int, ended_ns: int) -> None:
         """Note that data came during a read from `begun_ns` to `ended_ns`, in [ns] of monotonic time."""
         if self.empty_ns is not None and begun_ns - self.empty_ns > LONG_UNREAD_NS:
             return  # the process stalled: until all data is read, the duration of a read is no evidence
@@ -251,15 +251,16 @@ class LinkReader:
     def notices(self) -> list[Notice]:
         """Return the events of the link since the last call, with the user's name for it."""
         notices, self._notices = self._notices + self.link.notices(), []
-        prefix = self.link.prefix
-        if not prefix:
+        if not (prefix := self.link.prefix):
             return notices
-        return [one._replace(sensors=f"{prefix}{one.sensors}", text=f"{prefix[:-1]}: {one.text}") for one in notices]
+        return [
+            notice._replace(sensors=prefix + notice.sensors, text=f"{prefix[:-1]}: {notice.text}") for notice in notices
+        ]
 
     def counters(self) -> dict[str, int]:
         """Return the link's counters; of one that lasts, also its outages (losses, silences) and reopenings."""
-        told = {"outages": self.outages, "reopenings": self.reopenings} if self.link.lasts else {}
-        return self.link.counters() | told
+        losses = {"outages": self.outages, "reopenings": self.reopenings} if self.link.lasts else {}
+        return self.link.counters() | losses
 
     def _away_s(self) -> float:
         return (self._clock_ns() - (self._received_ns if self._lost_ns is None else self._lost_ns)) / 1e9

@@ -55,9 +55,9 @@ class CanBusLink(FrameLink):
         if interface in _NOT_THROUGH_PYTHON_CAN:
             raise SourceError(f"source is {self.name!r}: {_NOT_THROUGH_PYTHON_CAN[interface]}")
         self._can = _python_can()
-        known = set(self._can.VALID_INTERFACES) - set(_NOT_THROUGH_PYTHON_CAN)
-        if interface not in known:
-            raise SourceError(f"source is {self.name!r}, expected can:INTERFACE:CHANNEL of {', '.join(sorted(known))}")
+        usable = set(self._can.VALID_INTERFACES) - set(_NOT_THROUGH_PYTHON_CAN)
+        if interface not in usable:
+            raise SourceError(f"source is {self.name!r}, expected can:INTERFACE:CHANNEL of {', '.join(sorted(usable))}")
         self._interface = interface
         self._channel = channel
         self._counts = dict.fromkeys(("frames", "error_frames", "fd_frames"), 0)

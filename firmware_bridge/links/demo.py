@@ -41,8 +41,9 @@ class Robot:
         self.stated: deque[TimedPose] = deque()
         self._options = options
         rate_hz = recording.rate_hz or 0.0
-        poses = recording.poses if rate_hz else ()
-        self._poses: dict[int, _Stated] = {round(one.time_ns * rate_hz / 1e9): (one.pose, one.holds) for one in poses}
+        self._poses: dict[int, _Stated] = {
+            round(pose.time_ns * rate_hz / 1e9): (pose.pose, pose.holds) for pose in recording.poses if rate_hz
+        }
         tap = options.get("tap", np.zeros(0, dtype=int))
         begins = np.flatnonzero((tap[1:] > tap[:-1]) & (tap[1:] > 0)) + 1
         self._taps = {int(first): int(np.flatnonzero(tap == tap[first])[-1]) + 1 for first in begins}

@@ -29,7 +29,7 @@ class FrameLink(Link):
             if piece is None:
                 self._unread.empty_ns = min(now_ns, end_ns)  # this thread may not have run for long after the wait
             else:
-                self._unread.found(begun_ns, now_ns)
+                self._unread.note_data(begun_ns, now_ns)
                 with self._counting:
                     fed = self._take(piece, now_ns)
                 scans = self._unread.mark(fed, now_ns, self._stages.clock.begun_ns)

@@ -55,11 +55,11 @@ class ReplayLink(Link):
         """
         if rate_hz is not None and not 0 < rate_hz < math.inf:
             raise SourceError(f"rate is {rate_hz} Hz, expected a positive number")
-        self.recordings = [one if isinstance(one, Recording) else load_recording(one) for one in paths]
-        timed = next((one.path for one in self.recordings for track in one.tracks if track.time_ns is not None), None)
-        if not paced and rate_hz is not None and timed is not None:
-            raise SourceError(f"{timed} has times of its own, which are kept: leave out --rate-hz, or add --paced")
-        self.name = harmless(f"replay:{','.join(str(one.path) for one in self.recordings)}")
+        self.recordings = [path if isinstance(path, Recording) else load_recording(path) for path in paths]
+        timed = [file.path for file in self.recordings for track in file.tracks if track.time_ns is not None]
+        if not paced and rate_hz is not None and timed:
+            raise SourceError(f"{timed[0]} has times of its own, which are kept: leave out --rate-hz, or add --paced")
+        self.name = harmless(f"replay:{','.join(str(file.path) for file in self.recordings)}")
         self.kind: SourceKind = "replay"
         self.lasts = False
         self.patient = not paced
@@ -85,7 +85,7 @@ class ReplayLink(Link):
         if len(set(sensors)) < len(sensors):
             raise SourceError(f"recordings of sensors {', '.join(sensors)}: expected each sensor once")
         self._series = [ScanSeries(track.sensor, track.geometry) for track in self._tracks]
-        lasting = [one for one in self.recordings if one.poses and self._has_pose_times(one, rate_hz)]
+        lasting = [file for file in self.recordings if file.poses and self._has_pose_times(file, rate_hz)]
         self.states_poses = bool(lasting)
         self._poses_to_come = merge(*map(self._posed, lasting), key=itemgetter(0))
         self._next_pose = next(self._poses_to_come, None)
@@ -185,7 +185,7 @@ class ReplayLink(Link):
 
     def _take(self) -> Scan:
         """Return the next scan."""
-        due_ns, lane, row = (int(one[self._place]) for one in (self._due_ns, self._lane, self._row))
+        due_ns, lane, row = (int(column[self._place]) for column in (self._due_ns, self._lane, self._row))
         while self._next_pose is not None and self._next_pose[0] <= due_ns:
             self._poses.append(self._next_pose[1].later(self.first_ns))
             self._next_pose = next(self._poses_to_come, None)

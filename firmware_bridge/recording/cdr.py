@@ -47,10 +47,10 @@ class MessageType:
         """
         self.name = name
         self._text = text.strip()
-        self._parts = tuple(dict.fromkeys(one for part in parts for one in (part, *part._parts)))
-        known = {part.name.replace("/msg/", "/"): part for part in parts}
+        self._parts = tuple(dict.fromkeys(nested for part in parts for nested in (part, *part._parts)))
+        messages = {part.name.replace("/msg/", "/"): part for part in parts}
         lines = (line.partition("#")[0].strip() for line in text.splitlines())
-        self.fields = tuple(_field(line, known) for line in lines if line)
+        self.fields = tuple(_field(line, messages) for line in lines if line)
 
     @classmethod
     def of(cls, name: str, definition: str) -> "MessageType":
@@ -95,8 +95,8 @@ class MessageType:
             if message is not None:
                 if count is not None:
                     out += bytes(-len(out) % 4) + _LENGTH.pack(len(value))
-                for one in (value,) if count is None else value:
-                    message._write(out, one)
+                for part in (value,) if count is None else value:
+                    message._write(out, part)
             elif number is None:
                 text = value.encode() + b"\0"
                 out += bytes(-len(out) % 4) + _LENGTH.pack(len(text)) + text
@@ -122,8 +122,8 @@ class MessageType:
             if message is not None:
                 read: list[dict[str, Any]] = []
                 for _ in range(length):
-                    one, at = message._read(body, at)
-                    read.append(one)
+                    part, at = message._read(body, at)
+                    read.append(part)
                 values[name] = read[0] if count is None else read
             elif number is None:
                 if not 0 < length <= len(body) - at:
@@ -141,14 +141,14 @@ class MessageType:
         return values, at
 
 
-def _field(line: str, known: Mapping[str, MessageType]) -> Field:
+def _field(line: str, messages: Mapping[str, MessageType]) -> Field:
     match = _FIELD.fullmatch(line)
     if match is None:
         raise ValueError(f"{line!r} is not a field of a message")
     kind, array, length, name = match.groups()
     count = None if array is None else int(length or 0)
-    if kind in known and not count:
-        return Field(name, kind, length=count, message=known[kind])
+    if kind in messages and not count:
+        return Field(name, kind, length=count, message=messages[kind])
     if kind == "string" and count is None:
         return Field(name, kind)
     if kind in _NUMBERS:

@@ -126,10 +126,10 @@ class _Scans:
         for column, name in enumerate(names):
             matched = _TAXEL.fullmatch(name.lower())
             if matched is not None:
-                found, key = newtons if matched["force"] else counts, (int(matched["taxel"]), matched["axis"])
-                if key in found:
+                columns, key = newtons if matched["force"] else counts, (int(matched["taxel"]), matched["axis"])
+                if key in columns:
                     raise ValueError(f"two columns {name[:20]!r}, expected each of them once")
-                found[key] = column
+                columns[key] = column
             elif _TIMES & set(_words(name)):
                 self._time_names[column] = name
             elif name:
@@ -192,7 +192,7 @@ class _Scans:
         if self._newtons:
             newtons = _by_axis(np.frombuffer(self._newtons, np.float32), self._pad)
             sound = np.abs(newtons).max(axis=(1, 2, 3)) <= HIGHEST_NEWTONS  # False of NaN
-            vendor = tuple(VendorReading(one) if right else None for one, right in zip(newtons, sound, strict=True))
+            vendor = tuple(VendorReading(force) if right else None for force, right in zip(newtons, sound, strict=True))
         counts = _by_axis(np.frombuffer(self._counts, np.int32), self._pad)
         return Recording(
             path,

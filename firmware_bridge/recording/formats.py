@@ -15,7 +15,7 @@ def load_recording(path: str | Path) -> Recording:
     """
     path = Path(path)
     if path.is_dir():
-        there = ", ".join(sorted(one.name for one in path.glob("*.mcap"))[:5]) or "which holds no .mcap"
+        there = ", ".join(sorted(file.name for file in path.glob("*.mcap"))[:5]) or "which holds no .mcap"
         raise RecordingError(f"{path} is a folder: name a recording in it, as the .mcap of a rosbag2: {there}")
     # Each reader is imported where it is needed: that of MCAP loads a package.
     match path.suffix.lower():

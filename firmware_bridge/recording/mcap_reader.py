@@ -85,11 +85,11 @@ def load_mcap(path: Path) -> Recording:
     reading = _Reading(path)
     with path.open("rb") as file:
         try:
-            for one in messages(file, reading.topic_of):
-                if isinstance(one, Metadata):
-                    reading.take_metadata(one.name, one.metadata)
+            for record in messages(file, reading.topic_of):
+                if isinstance(record, Metadata):
+                    reading.take_metadata(record.name, record.metadata)
                 else:
-                    reading.take_message(*one)
+                    reading.take_message(*record)
         except CutOffError as end:
             reading.notes.insert(0, f"{path} breaks off ({end}): its recording was killed, or the disk was full")
         except DamageError as damage:
@@ -123,10 +123,10 @@ class _Reading:
 
     def recording(self) -> Recording:
         """Return what was read; a RecordingError without scans."""
-        scanned = {name: one for name, one in self._sensors.items() if one.times_ns}
+        scanned = {name: entry for name, entry in self._sensors.items() if entry.times_ns}
         if not scanned:
             self._refuse(f"no scans that edge-sr recorded{self._instead()}")
-        bare = [] if self._described else sorted(name for name, one in scanned.items() if one.facts is None)
+        bare = [] if self._described else sorted(name for name, entry in scanned.items() if entry.facts is None)
         if bare:
             self.notes.append(
                 f"{self._path}: the mounting of sensor {', '.join(bare)} is not in the file, as after a tool that "
@@ -134,10 +134,10 @@ class _Reading:
             )
         return Recording(
             self._path,
-            tuple(one.track(name, self._geometry) for name, one in scanned.items()),
+            tuple(entry.track(name, self._geometry) for name, entry in scanned.items()),
             None,
-            {name: one.baseline for name, one in scanned.items() if one.baseline is not None},
-            {name: one.mounting for name, one in scanned.items() if one.mounting is not None},
+            {name: entry.baseline for name, entry in scanned.items() if entry.baseline is not None},
+            {name: entry.mounting for name, entry in scanned.items() if entry.mounting is not None},
             self._offset_ns,
             tuple(self.notes),
             self._origin,
@@ -158,11 +158,11 @@ class _Reading:
         if schema.name in (SCAN_NAME, BASELINE_NAME) and sized is not None and not self._named:
             self._geometry = _pad_with(int(sized[1]) // len(AXES))
         taxels = self._geometry.taxel_count
-        known = {kind.name: kind for kind in (scan_type(taxels), baseline_type(taxels), POSE, SENSOR)}.get(schema.name)
-        if known is not None and (schema.encoding, schema.data) != ("ros2msg", known.definition.encode()):
-            self._refuse(f"its {known.name} is of another release of edge-sr than this one")
+        wanted = {kind.name: kind for kind in (scan_type(taxels), baseline_type(taxels), POSE, SENSOR)}.get(schema.name)
+        if wanted is not None and (schema.encoding, schema.data) != ("ros2msg", wanted.definition.encode()):
+            self._refuse(f"its {wanted.name} is of another release of edge-sr than this one")
         self._sized = self._sized or schema.name in (SCAN_NAME, BASELINE_NAME)
-        return known
+        return wanted
 
     def take_metadata(self, name: str, fields: Mapping[str, str]) -> None:
         """Process a record of metadata."""
@@ -180,10 +180,10 @@ class _Reading:
                 mounting = read_mounting(fields.get("mounting", ""), self._geometry.taxel_count)
             except ValueError as error:
                 self._refuse(f"no mounting of sensor {sensor[:20]!r}: {short(error)}")
-            one = self._sensor(sensor)
-            if one.mounting not in (None, mounting):
+            entry = self._sensor(sensor)
+            if entry.mounting not in (None, mounting):
                 self._refuse(f"two mountings of sensor {sensor[:20]!r}, expected one: cut it in parts")
-            one.mounting = mounting
+            entry.mounting = mounting
 
     def _take_geometry(self, fields: Mapping[str, str]) -> None:
         try:
@@ -202,8 +202,8 @@ class _Reading:
     def _take_facts(self, data: memoryview) -> None:
         fields = SENSOR.decode(data)
         sensor, text = fields["sensor"], fields["facts"]
-        one = self._sensor(sensor)
-        if one.facts == text:
+        entry = self._sensor(sensor)
+        if entry.facts == text:
             return
         try:
             for name, values in json.loads(text).items():
@@ -212,7 +212,7 @@ class _Reading:
             raise
         except (ValueError, AttributeError, RecursionError) as error:
             raise CdrError(f"facts of sensor {sensor[:20]!r} that cannot be read: {short(error)}") from error
-        one.facts = text
+        entry.facts = text
 
     def take_message(self, topic: tuple[str, MessageType], log_ns: int, data: memoryview) -> None:
         """Process a message of a topic, logged at a time in [ns] since 1970."""
@@ -232,8 +232,8 @@ class _Reading:
     def _take_scan(self, scan: RecordedScan, log_ns: int) -> None:
         if scan.frame == f"emulated/{scan.sensor}":
             self._origin = "emulated"
-        one = self._sensor(scan.sensor)
-        if not one.times_ns:
+        entry = self._sensor(scan.sensor)
+        if not entry.times_ns:
             self._sensors[scan.sensor] = self._sensors.pop(scan.sensor)
         if self._offset_ns is None:
             self._offset_ns = log_ns - scan.time_ns
@@ -241,18 +241,18 @@ class _Reading:
         if not 0 <= unix_ns < LAST_STAMP_NS:  # such a scan could be played, but not recorded again
             got = f"a scan of sensor {scan.sensor!r} at {unix_ns:,} ns since 1970"
             self._refuse(f"{got}, expected 0..{LAST_STAMP_NS:,}")
-        if one.times_ns and scan.time_ns < one.times_ns[-1]:
+        if entry.times_ns and scan.time_ns < entry.times_ns[-1]:
             self._refuse(f"times of sensor {scan.sensor!r} that go back, expected none")
         self._kept_bytes += 240 if scan.vendor is None else 1440
         if self._kept_bytes > MOST_KEPT_BYTES:
             self._refuse(f"more scans than {MOST_KEPT_BYTES:,} bytes hold: cut it in parts")
         if scan.vendor is not None:
-            one.vendor[len(one.times_ns)] = scan.vendor
-        one.counts += scan.counts.tobytes()
-        one.numbers.append(scan.number)
-        one.times_ns.append(scan.time_ns)
-        one.device_times_ns.append(scan.device_time_ns)
-        one.renewed.append(scan.renewed)
+            entry.vendor[len(entry.times_ns)] = scan.vendor
+        entry.counts += scan.counts.tobytes()
+        entry.numbers.append(scan.number)
+        entry.times_ns.append(scan.time_ns)
+        entry.device_times_ns.append(scan.device_time_ns)
+        entry.renewed.append(scan.renewed)
 
     def _take_pose(self, timed: TimedPose) -> None:
         self._poses.append(timed)
@@ -262,12 +262,12 @@ class _Reading:
             self._refuse(f"more than {MOST_POSES:,} poses: cut it in parts")
 
     def _take_baseline(self, baseline: Baseline) -> None:
-        one = self._sensor(baseline.sensor)
-        before, one.latest = one.latest, baseline
+        entry = self._sensor(baseline.sensor)
+        before, entry.latest = entry.latest, baseline
         # A part of a file may have it after a sensor's first scan, which was made with it: it is repeated.
-        first_ns = one.times_ns[0] + (self._offset_ns or 0) if one.times_ns else 0
-        if not one.times_ns or (before is None and baseline.created_unix_s < first_ns / NS_PER_S):
-            one.baseline = baseline
+        first_ns = entry.times_ns[0] + (self._offset_ns or 0) if entry.times_ns else 0
+        if not entry.times_ns or (before is None and baseline.created_unix_s < first_ns / NS_PER_S):
+            entry.baseline = baseline
         elif before is not None and before.id != baseline.id and len(self.notes) < MOST_SENSORS:
             self.notes.append(
                 f"{self._path}: sensor {baseline.sensor} was zeroed again while it was recorded ({before.id}, then "

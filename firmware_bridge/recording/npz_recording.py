@@ -191,8 +191,8 @@ def _baselines(arrays: Mapping[str, NDArray[Any]], tracks: Sequence[Track]) -> d
         own = arrays["baseline_counts"][first].astype(np.float32)
         if not text or track.time_ns is None:
             continue
-        known = np.isnan(own) | ((own >= 0) & (own <= HIGHEST_COUNT + 1))
-        if not known.all() or not is_sensor_name(text):
+        in_range = np.isnan(own) | ((own >= 0) & (own <= HIGHEST_COUNT + 1))
+        if not in_range.all() or not is_sensor_name(text):
             _refuse("baseline_counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
         own.setflags(write=False)
         taken_s = int(track.time_ns[0]) / NS_PER_S - (age_s if 0 <= age_s <= LAST_UNIX_S else math.nan)
@@ -203,21 +203,20 @@ def _baselines(arrays: Mapping[str, NDArray[Any]], tracks: Sequence[Track]) -> d
 def _mountings(text: str, tracks: Sequence[Track]) -> dict[str, Mounting]:
     try:
         texts = json.loads(text)
-        return {
-            one.sensor: read_mounting(texts[one.sensor], one.counts[0, 0].size) for one in tracks if one.sensor in texts
-        }
+        taxels = {track.sensor: track.counts[0, 0].size for track in tracks}
+        return {sensor: read_mounting(texts[sensor], count) for sensor, count in taxels.items() if sensor in texts}
     except (ValueError, TypeError, RecursionError) as error:
         _refuse("mountings", " ".join(str(error).split())[:120], "JSON as `edge-sr convert` writes it")
 
 
 def _poses(arrays: Mapping[str, NDArray[Any]]) -> list[TimedPose]:
     """Return the poses; other programs may leave out all but their times and numbers."""
-    found = [name for name in _POSES if name in arrays]
-    if not found:
+    names = [name for name in _POSES if name in arrays]
+    if not names:
         return []
     for name in ("pose_time_ns", "pose"):
         if name not in arrays:
-            raise NpzError(f"array '{name}': missing, expected together with '{found[0]}'")
+            raise NpzError(f"array '{name}': missing, expected together with '{names[0]}'")
     count = arrays["pose_time_ns"].size
     if count > MOST_POSES:
         _refuse("pose", f"{count:,} poses", f"at most {MOST_POSES:,}: cut it in parts")

@@ -104,7 +104,7 @@ def encode_scan(scan: Scan, frame: str, unix_ns: int, fresh: int, renewed: int) 
 
     `frame` is that of the results' messages, so that raw scans are marked, too, where their source is no device.
     """
-    vendor = ((one.name, getattr(scan.vendor, one.name, None)) for one in dataclass_fields(VendorReading))
+    vendor = ((field.name, getattr(scan.vendor, field.name, None)) for field in dataclass_fields(VendorReading))
     return scan_type(scan.fresh.size).encode(
         {
             "header": _header(frame, unix_ns),

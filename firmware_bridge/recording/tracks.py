@@ -94,10 +94,10 @@ class Recording:
 
 def origin_of(kinds: Iterable[str | None]) -> Literal["device", "emulated"] | None:
     """Return the origin of scans of these kinds of sources together, None if it is uncertain."""
-    found = set(kinds)
-    if "emulated" in found:
+    kinds = set(kinds)
+    if "emulated" in kinds:
         return "emulated"
-    return "device" if found == {"device"} else None
+    return "device" if kinds == {"device"} else None
 
 
 def is_rate(rate_hz: float) -> bool:

@@ -61,7 +61,7 @@ class PadFrame:
     def __post_init__(self) -> None:
         if not self.parent or self.parent.startswith("/") or not self.parent.isprintable() or " " in self.parent:
             raise ValueError(f"parent is {self.parent[:40]!r}, expected the name of a frame such as tool0")
-        if len(self.place_mm) != 3 or not all(abs(one) <= LARGEST_MM for one in self.place_mm):
+        if len(self.place_mm) != 3 or not all(abs(place) <= LARGEST_MM for place in self.place_mm):
             raise ValueError(f"place_mm is {self.place_mm}, expected three numbers up to {LARGEST_MM:g}")
         if len(self.quaternion) != 4 or not abs(math.hypot(*self.quaternion) - 1) <= 1e-3:
             raise ValueError(f"quaternion is {self.quaternion}, expected x, y, z, w of norm 1")
@@ -115,12 +115,12 @@ class SensorFile:
     @property
     def mountings(self) -> dict[str, Mounting]:
         """Mountings by sensor name."""
-        return self._known("mounting")
+        return self._by_sensor("mounting")
 
     @property
     def orders(self) -> dict[str, tuple[int, ...]]:
         """Orders of the taxels by sensor name, for sensors that differ from the id map."""
-        return {name: one.order for name, one in self.mountings.items() if one.moves_taxels}
+        return {name: mounting.order for name, mounting in self.mountings.items() if mounting.moves_taxels}
 
     @property
     def model_map(self) -> ModelMap:
@@ -135,34 +135,34 @@ class SensorFile:
     @property
     def baselines(self) -> dict[str, Baseline]:
         """Available baselines by sensor name."""
-        return self._known("baseline")
+        return self._by_sensor("baseline")
 
     @property
     def counts_per_newton(self) -> dict[str, float]:
         """Summed z per [N] by sensor name, where it is available."""
-        return self._known("counts_per_newton")
+        return self._by_sensor("counts_per_newton")
 
     @property
     def scale_intervals(self) -> dict[str, tuple[float, float]]:
         """90 % intervals of the counts per newton by sensor name, where they are available."""
-        return self._known("counts_per_newton_interval")
+        return self._by_sensor("counts_per_newton_interval")
 
     @property
     def frames(self) -> dict[str, PadFrame]:
         """Places of the pads on the robot by sensor name, where they are available."""
-        return self._known("frame")
+        return self._by_sensor("frame")
 
     @property
     def measured_pads(self) -> dict[str, Pad]:
         """Pads without what was learned, by sensor name."""
-        return self._known("pad")
+        return self._by_sensor("pad")
 
     @property
     def pads(self) -> dict[str, Pad]:
         """Pads in use by sensor name, with what was learned."""
-        return self._known("used_pad")
+        return self._by_sensor("used_pad")
 
-    def _known(self, name: str) -> dict[str, Any]:
+    def _by_sensor(self, name: str) -> dict[str, Any]:
         values = {sensor: getattr(entry, name) for sensor, entry in self.sensors.items()}
         return {sensor: value for sensor, value in values.items() if value is not None}
 
@@ -198,7 +198,7 @@ def load_sensor_file(path: str | Path) -> SensorFile:
 
 
 def _sensor_tables(value: Any) -> dict[str, dict[str, Any]]:
-    if not isinstance(value, dict) or not value or not all(isinstance(one, dict) for one in value.values()):
+    if not isinstance(value, dict) or not value or not all(isinstance(table, dict) for table in value.values()):
         raise ValueError("a table for each sensor, such as [sensors.4]")
     if not all(map(is_sensor_name, value)):
         raise ValueError(f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
@@ -221,17 +221,17 @@ def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
     }
     taken = {key: table.take(key, read, required=False) for key, read in readers.items()}
     table.end()
-    known = {key: value for key, value in taken.items() if value is not None}
-    if "counts_per_newton_interval" in known:
-        low, high = known["counts_per_newton_interval"]
-        if not low <= known.get("counts_per_newton", math.nan) <= high:
-            found = f"{[low, high]} of {known.get('counts_per_newton', 'no counts_per_newton')}"
-            table.refuse("counts_per_newton_interval", found, "an interval around counts_per_newton")
-    mounting = {key: known.pop(key) for key in ("order", "swap_xy", "signs", "gains") if key in known}
+    values = {key: value for key, value in taken.items() if value is not None}
+    if "counts_per_newton_interval" in values:
+        low, high = values["counts_per_newton_interval"]
+        if not low <= values.get("counts_per_newton", math.nan) <= high:
+            given = f"{[low, high]} of {values.get('counts_per_newton', 'no counts_per_newton')}"
+            table.refuse("counts_per_newton_interval", given, "an interval around counts_per_newton")
+    mounting = {key: values.pop(key) for key in ("order", "swap_xy", "signs", "gains") if key in values}
     for key, read in parts.items():
-        if key in known:
-            known[key] = read(table.part(key, known[key]), name, geometry)
-    return SensorEntry(Mounting(**mounting, taxel_count=geometry.taxel_count), **known)
+        if key in values:
+            values[key] = read(table.part(key, values[key]), name, geometry)
+    return SensorEntry(Mounting(**mounting, taxel_count=geometry.taxel_count), **values)
 
 
 def _pad(table: Table, sensor: str, geometry: SensorGeometry) -> Pad:
@@ -248,8 +248,8 @@ def _pad(table: Table, sensor: str, geometry: SensorGeometry) -> Pad:
     table.end()
     if places["gains"] is None and places["gain_half_widths"] is not None:
         table.refuse("gain_half_widths", "without gains", "both, or none")
-    known = {name: ends for name, ends in intervals.items() if ends is not None}
-    return Pad(**constants, intervals=known, **places)
+    stated = {name: ends for name, ends in intervals.items() if ends is not None}
+    return Pad(**constants, intervals=stated, **places)
 
 
 def _frame(table: Table, sensor: str, geometry: SensorGeometry) -> PadFrame:
@@ -282,18 +282,18 @@ def _baseline(table: Table, sensor: str, geometry: SensorGeometry) -> Baseline:
 
 
 def _marks(value: Any) -> frozenset[str]:
-    if not isinstance(value, list) or not all(isinstance(one, str) and one in PARTS for one in value):
+    if not isinstance(value, list) or not all(isinstance(mark, str) and mark in PARTS for mark in value):
         raise ValueError(f"a list of {', '.join(PARTS)}")
     return frozenset(value)
 
 
-def _are_signs(found: list[Any]) -> bool:
-    return all(type(sign) is int and sign in (1, -1) for sign in found)
+def _are_signs(signs: list[Any]) -> bool:
+    return all(type(sign) is int and sign in (1, -1) for sign in signs)
 
 
 def _gains(geometry: SensorGeometry, value: Any) -> tuple[float, ...]:
     expected = f"positive numbers, 3, or {len(AXES)} x {geometry.rows} x {geometry.cols}"
-    per_taxel = isinstance(value, list) and any(isinstance(one, list) for one in value)
+    per_taxel = isinstance(value, list) and any(isinstance(part, list) for part in value)
     shape = geometry.scan_shape if per_taxel else (len(AXES),)
     gains = numbers(shape, expected, low=LEAST_POSITIVE)(value)
     return gains if per_taxel else tuple(gain for gain in gains for _ in range(geometry.taxel_count))

@@ -41,7 +41,7 @@ FILE_VERSION: Final = 1
 LAST_UNIX_S: Final = 1e11  # latest valid time, in [s] since 1970 (the year 5138)
 _FILE_REMEDY: Final = "zero again and save a new file"
 _read_entries: Final = reader(
-    lambda value: isinstance(value, list) and value != [] and all(isinstance(one, dict) for one in value),
+    lambda value: isinstance(value, list) and value != [] and all(isinstance(entry, dict) for entry in value),
     "a list of at least one object",
 )
 _read_sensor: Final = reader(
@@ -176,8 +176,8 @@ class BaselineEstimator:
         refuse_motion(counts)
         baseline = Baseline.from_counts(scan.sensor, counts, self._clock())
         if silent is not None:
-            known = np.where(silent, np.float32(np.nan), baseline.counts)
-            baseline = Baseline.of(scan.sensor, known, baseline.created_unix_s, baseline.scans, baseline.origin)
+            free_counts = np.where(silent, np.float32(np.nan), baseline.counts)
+            baseline = Baseline.of(scan.sensor, free_counts, baseline.created_unix_s, baseline.scans, baseline.origin)
         if self._reference is not None:
             refuse_load(baseline, self._reference)
         return baseline
@@ -280,8 +280,8 @@ def refuse_load(baseline: Baseline, reference: Baseline) -> None:
     """Raise a BaselineRefusedError if a taxel lies more than LOAD_LIMIT_COUNTS above a reference: it was loaded."""
     z = len(AXES) - 1
     # A taxel that is missing in either baseline is no evidence of a load.
-    known = np.where(np.isnan(baseline.counts), 0, baseline.counts)
-    load = deformation(np.rint(known).astype(np.int32) % COUNTS_ON_CIRCLE, reference)
+    counts = np.where(np.isnan(baseline.counts), 0, baseline.counts)
+    load = deformation(np.rint(counts).astype(np.int32) % COUNTS_ON_CIRCLE, reference)
     load[np.isnan(baseline.counts) | np.isnan(reference.counts)] = 0
     row, col = _worst(load[z])
     if load[z, row, col] > LOAD_LIMIT_COUNTS:

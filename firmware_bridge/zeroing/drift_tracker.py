@@ -159,7 +159,7 @@ class DriftTracker:
     def _settle(self, level: NDArray[np.float32]) -> bool:
         self._resting = True
         step = np.where(self._live, level - self.counts, np.float32(0))
-        known = self._step
+        last_step = self._step
         common, own = self._parts(step)
         stepped = np.abs(step).max() > STEP_COUNTS
         if self._cause == _ZEROED and np.abs(common).max() <= COMMON_COUNTS and _alike(common, own):
@@ -175,7 +175,7 @@ class DriftTracker:
         before, self.note = self.note, self._step_note()
         if not stepped:
             self._event = None if before is None else "rest level is back where it was"
-        elif before is None or known is None or np.abs(step - known).max() > STEP_COUNTS:
+        elif before is None or last_step is None or np.abs(step - last_step).max() > STEP_COUNTS:
             self._event = self.note
         self._sum_up()
         return self.note != before or self._event is not None

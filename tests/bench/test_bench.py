@@ -59,7 +59,7 @@ def test_everyone_has_its_error_and_its_run_time(bench):
     assert all(float(row["paced_p50_us"]) > 0 and float(row["start_up_ms"]) > 0 for row in timed)
 
 
-def test_a_file_that_is_no_model_is_left_out_and_another_scale_is_run_time_only(bench):
+def test_a_broken_model_is_left_out_and_another_scale_only_timed(bench):
     left_out, run_time_only = bench[1].splitlines()
     assert left_out.startswith("edge-sr: left out: ")
     assert "broken.onnx: not a model that onnxruntime can load" in left_out
@@ -86,7 +86,7 @@ def test_the_error_is_that_which_contracts_are_judged_by():
         assert {key: row.error[key] for key in expected} == expected
 
 
-def test_force_is_what_patterns_sum_up_to_by_the_true_patterns_own_factor():
+def test_force_is_a_patterns_sum_by_the_true_patterns_factor():
     volume = FROZEN.patterns().sum(axis=(1, 2), dtype=np.float64)
     factor = (volume @ FROZEN.force_n) / (volume @ volume)
     floor = 100 * np.sqrt(np.mean((factor * volume - FROZEN.force_n) ** 2)) / FORCE_RANGE_N
@@ -104,7 +104,7 @@ def test_force_is_what_patterns_sum_up_to_by_the_true_patterns_own_factor():
         (["--out", str(ROOT / "README.md")], "cannot be made"),
     ],
 )
-def test_what_cannot_be_used_is_said_in_a_line_before_anything_is_measured(arguments, complaint, capsys):
+def test_unusable_input_is_said_in_a_line_before_measuring(arguments, complaint, capsys):
     assert main(["bench", *arguments]) in (2, 4)
     said = capsys.readouterr()
     assert complaint in said.err
@@ -152,7 +152,7 @@ def made():
     return provenance('python x.py --out "a b"', [ROOT / SOURCE, "edge/bench"], [find_model(DEFAULT_MODEL)], seed=3)
 
 
-def test_a_head_names_commit_seed_and_the_hashes_of_its_inputs_and_is_read_as_it_was_written(made):
+def test_a_head_is_read_as_written_with_the_hashes_of_its_inputs(made):
     page = with_head("# mine\n\nText.\n", made)
     assert page.startswith("# mine\n\n```toml\ncommand = ") and page.endswith("```\n\nText.\n")
     assert read_provenance(page) == made
@@ -248,7 +248,7 @@ def test_ticks_whose_run_is_not_done_in_time_are_missed(took_ms, ticks, done, mi
     assert found.times.max_us == 1e3 * max(took_ms)
 
 
-def test_a_machine_that_stands_still_from_the_first_still_gives_a_figure():
+def test_a_machine_that_halts_at_once_still_gives_a_figure():
     clock = Clock()
     run, numbers = clock.work(1)
     asked = []
@@ -303,13 +303,13 @@ def test_a_commit_that_cannot_be_run_is_named_and_is_not_red(capsys):
     assert "no-such-commit: fatal" in capsys.readouterr().out
 
 
-def test_pairs_are_drawn_together_so_that_what_meets_both_cancels():
+def test_pairs_are_drawn_together_so_that_common_noise_cancels():
     weather = np.random.default_rng(3).uniform(1, 3, 30)
     paired = ratio_of(2 * weather, weather)
     assert (paired.ratio, paired.low, paired.high) == pytest.approx((2, 2, 2)) and str(paired) == "2 (2..2)"
 
 
-def test_the_cost_of_the_program_is_a_line_for_rest_and_contact_of_each_tree(limits, capsys):
+def test_the_programs_cost_is_a_line_for_rest_and_for_contact(limits, capsys):
     limits(program_cost, SETTLE_S=0.5, ROUNDS=1)
     assert program_cost.main(["--round-s", "0.5"]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -47,7 +47,7 @@ FRAME = message_of(frames_of(1)[0])
 # Clocks.
 
 
-def test_frames_without_stamps_and_those_of_fd_and_errors_of_which_nobody_knows_the_meaning(bus):
+def test_frames_without_stamps_frames_of_fd_and_unknown_errors(bus):
     now_ns = itertools.count(5 * 10**12, 1_000_000)  # a machine that pauses here must make no pause on the bus
     with link_to(bus, clock_ns=now_ns.__next__) as link:
         for message in (message_of(frames_of(1)[0], is_fd=True), BUS_OFF, *map(message_of, frames_of(1))):

@@ -49,7 +49,7 @@ class Watched(GsUsbAdapter):
 
 
 @pytest.mark.parametrize("code", [IO, PIPE])
-def test_an_unplugging_may_come_as_another_error_and_a_signal_is_none(code):
+def test_an_unplugging_may_be_another_error_and_a_signal_is_none(code):
     def interrupt(data):
         if signals:
             raise signals.pop()

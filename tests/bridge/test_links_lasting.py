@@ -201,7 +201,7 @@ def test_trouble_is_told_twice_and_lost_stamps_once():
     ]
 
 
-def test_a_clock_that_was_set_by_readings_which_waited_gives_no_times():
+def test_a_clock_set_by_readings_that_waited_gives_no_times():
     """Stamps of readings that nobody fetched set the adapter's clock, and by it they were new."""
     unread, ms = Unread(), 1_000_000
     unread.empty_ns = 0
@@ -210,7 +210,7 @@ def test_a_clock_that_was_set_by_readings_which_waited_gives_no_times():
     assert (old.unread_ns, old.device_ns, old.not_before_ns) == (100 * ms, None, 0)
     (old,) = unread.mark([scan], 101 * ms, clock_begun_ns=-ms)
     assert (old.unread_ns, old.device_ns) == (100 * ms, 99 * ms)
-    unread.found(101 * ms, 103 * ms)
+    unread.note_data(101 * ms, 103 * ms)
     assert unread.empty_ns == 0, "until all data is read, the duration of a read is no evidence"
     unread.empty_ns = 101 * ms
     assert unread.mark([replace(scan, time_ns=102 * ms)], 102 * ms, None)[0].unread_ns == 0

@@ -191,7 +191,7 @@ class TestRecord:
         assert (recording.tracks[0].counts == np.stack([scan.counts for scan in seen])).all()
         assert "breaks off (without an end" in recording.notes[0] or "within a record" in recording.notes[0]
 
-    def test_of_what_a_full_disk_cut_off_no_more_is_said_than_is_sure(self, made, tmp_path):
+    def test_of_a_full_disk_no_more_scans_are_claimed_than_are_sure(self, made, tmp_path):
         path, disk = tmp_path / "full.mcap", partial(resource.setrlimit, resource.RLIMIT_FSIZE, (40_000, 40_000))
         process = start("record", path, *source_of(made, 60), preexec_fn=disk)
         _, said = process.communicate()

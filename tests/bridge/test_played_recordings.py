@@ -168,7 +168,7 @@ def test_it_plays_through_and_ends_or_begins_again(recording, loop, rate_hz, rou
     assert len(scans) == (75 if loop else 30)
 
 
-def test_leaving_early_and_a_port_that_does_not_open_leave_no_emulator(recording, monkeypatch):
+def test_an_early_end_or_a_port_that_fails_leaves_no_emulator(recording, monkeypatch):
     def refuse(link):
         raise DeviceError("no port")
 

@@ -110,7 +110,7 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line():
     assert done.err == f"slcan:{emulator.port}: watching for 0.7 s; keep the pad free and still\n"
 
 
-def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypatch, tmp_path):
+def test_the_next_run_goes_by_the_order_axes_and_force_measured(monkeypatch, tmp_path):
     sits = Mounting(orders()["turned by 90 degrees clockwise"], True, (1, -1, -1))
     file = tmp_path / "sensor.toml"
     person = Person(sits)
@@ -153,7 +153,7 @@ def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path):
     assert cli.main(["doctor", "--rehearse", "--source", "demo"]) == 2
 
 
-def test_two_sensors_are_pressed_one_after_the_other_and_compared_in_a_grip():
+def test_two_sensors_are_pressed_in_turn_and_compared_in_a_grip():
     people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person(grip_counts=5000, z_noise_counts=6)]
     with Emulator([recording(*people, rate_hz=120.0)], jitter_s=0.0) as emulator:
         asked = ("--json", "--rate-hz", 120)
@@ -199,7 +199,7 @@ class Impatient(Person):
         return ""
 
 
-def test_enter_skips_a_request_and_what_is_not_measured_is_no_success():
+def test_enter_skips_a_request_and_a_skipped_one_is_no_success():
     """At the keyboard of a real pseudo-terminal; the felt load is shown meanwhile."""
     person = Impatient()
     with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:

@@ -60,7 +60,7 @@ class TestLoss:
         assert (now.counts_per_newton, now.baseline is None) == (held.counts_per_newton, held.baseline is None)
         assert load_sensor_file(path.with_name("s.toml.bak")).sensors.keys() == {"4"}
 
-    def test_a_pad_that_is_pressed_now_leaves_the_baseline_of_the_free_pad(self, tmp_path):
+    def test_a_pressed_pad_leaves_the_baseline_of_the_free_pad(self, tmp_path):
         path, free = tmp_path / "s.toml", healthy_counts(200)
         baseline = Baseline.from_counts("4", free, 1.79e9)
         entry = SensorEntry(baseline=baseline, emulated=frozenset({"baseline"}))
@@ -84,7 +84,7 @@ class TestLoss:
         now = load_sensor_file(path)
         assert now.pads == {"4": learned, "6": learned} and now.baselines["4"].id == BASELINE.id
 
-    def test_a_file_that_was_not_given_as_well_is_refused_before_the_visit(self, good):
+    def test_a_file_not_given_as_input_is_refused_before_the_visit(self, good):
         check_writable(good, load_sensor_file(good))
         content = good.read_text()
         with pytest.raises(
@@ -93,7 +93,7 @@ class TestLoss:
             told("--out", good, link=lambda: pytest.fail("it was opened"))
         assert good.read_text() == content
 
-    def test_the_file_of_a_device_is_not_written_of_an_emulated_sensor(self, good):
+    def test_an_emulated_sensor_does_not_overwrite_a_devices_file(self, good):
         link = FakeLink([WELL], kind="emulated")
         with pytest.raises(SensorFileError, match="it is of a device, and this one is emulated"):
             told("--sensor", good, "--out", good, link=lambda: link)
@@ -171,7 +171,7 @@ def test_the_last_line_says_it():
 
 
 @pytest.mark.parametrize("name", ["no/such/s.toml", "", "/proc/s.toml"])
-def test_a_file_that_cannot_be_written_is_refused_before_anything_is_opened(tmp_path, name):
+def test_an_unwritable_file_is_refused_before_anything_is_opened(tmp_path, name):
     def open_link():
         raise AssertionError("opened")
 
@@ -180,7 +180,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_opened(tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_was_found_is_told_though_the_file_cannot_be_written_any_more(tmp_path):
+def test_findings_are_printed_though_the_file_became_unwritable(tmp_path):
     folder = tmp_path / "stick"
     folder.mkdir()
     out = io.StringIO()

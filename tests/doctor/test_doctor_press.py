@@ -55,7 +55,7 @@ def test_every_turn_and_every_axis_is_found(name):
         assert (findings["axis signs"].verdict == "ok") == (not mounting.turns_axes)
 
 
-def test_a_skipped_corner_is_left_out_and_its_finger_is_not_taken_for_the_next():
+def test_a_skipped_corners_finger_does_not_count_for_the_next():
     guide = GuidedPress()
     pressed = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(0)])
     answer_to([pressed] * 10, guide)

@@ -29,7 +29,7 @@ def test_a_ball_is_let_go_of_where_it_would_pull():
     assert away_mm[pressure > 0].max() == pytest.approx((40 * DEPTH_MM) ** 0.5, abs=CELL_MM)
 
 
-def test_a_point_below_an_even_round_load_sinks_as_far_as_it_should():
+def test_a_point_below_an_even_round_load_sinks_by_closed_form():
     """On the axis ((1 - nu) (s - z) + z (1 - z / s) / 2) / G for a pressure of 1, s the distance of the load's rim."""
     poisson, z = 0.45, 2.5
     taxel_mm = USPA44.taxel_centres_mm()[5]

@@ -46,7 +46,7 @@ def test_drag_is_no_other_press(inverse, pressed):
     assert found_db(inverse, pressed, [2], [(0, 0, 0)]) > 29
 
 
-def test_an_earlier_tap_helps_from_where_it_was_and_from_no_other_place(inverse, pressed):
+def test_an_earlier_tap_helps_only_from_where_it_was(inverse, pressed):
     right = found_db(inverse, pressed, [0, 1], [(0, 0, 0), (SHIFT_MM, 0, TURN_DEG)])
     for wrong in ((-SHIFT_MM, 0, TURN_DEG), (SHIFT_MM, 0, -TURN_DEG)):
         assert right > 30 and right > found_db(inverse, pressed, [0, 1], [(0, 0, 0), wrong]) + 3

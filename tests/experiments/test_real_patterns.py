@@ -42,7 +42,7 @@ def every_other_scan() -> list[Grip]:
     return [replace(grip, counts=grip.counts[::2]) for grip in recorded_grips(RECORDINGS)]
 
 
-def test_every_scan_under_load_is_one_sheet_over_the_pad_and_believed(played):
+def test_scans_under_load_are_one_sheet_on_the_pad_and_believed(played):
     assert sorted(played) == sorted(f"{path.parent.name} {path.stem}" for path in PATHS)
     for name, one in played.items():
         assert len(one.patterns) > 50 and np.isfinite(one.patterns).all(), name

@@ -167,7 +167,7 @@ def test_a_loop_that_was_left_goes_on_with_the_next_result():
     assert results.statistics.scans == 11
 
 
-def test_a_sensor_that_something_is_given_of_and_that_is_never_heard_is_told():
+def test_a_silent_sensor_that_an_option_names_is_reported():
     link = FakeLink([[make_scan(n)] for n in range(100)])
     events = []
     with Source(link) as source:
@@ -204,7 +204,7 @@ def test_the_doctors_findings_are_those_of_the_api(files):
 PRESSES = [0, 3000, 3000, 0, 0, 3000, 3000]
 
 
-def test_poses_that_another_thread_states_are_those_of_the_next_scans():
+def test_poses_of_another_thread_are_those_of_the_next_scans():
     steps = [threading.Event() for _ in PRESSES]
     batches = []
     for number, (press, step) in enumerate(zip(PRESSES, steps, strict=True)):
@@ -244,7 +244,7 @@ def test_of_a_recording_poses_are_stated_at_its_own_times(tmp_path):
         assert {result.pose for result in stream} == {PadPose(3, 4)}
 
 
-def test_an_npz_holds_the_pose_of_each_scan_and_a_row_for_each_tap(tmp_path):
+def test_an_npz_holds_each_scans_pose_and_a_row_for_each_tap(tmp_path):
     contract, made = make_posed_contract(), []
     batches = [[make_scan(number, press_counts=press)] for number, press in enumerate(PRESSES)]
     with Source(FakeLink(batches)) as source:

@@ -46,7 +46,7 @@ VENDORS = np.moveaxis(COUNTS, 1, -1).reshape(-1, 16, 3)
         (VENDORS.reshape(-1, 48).astype(np.float32), VENDORS.reshape(-1, 48)[:5]),
     ],
 )
-def test_arrays_as_numpy_loads_them_and_in_the_vendors_order_are_taken(counts, baseline):
+def test_arrays_of_floats_and_in_the_vendors_order_are_taken(counts, baseline):
     expected, results = infer(FakeModel(), COUNTS, REST), infer(FakeModel(), counts, baseline)
     assert [result.state for result in results] == [result.state for result in expected]
     for result, other in zip(results, expected, strict=True):
@@ -128,7 +128,7 @@ def test_a_pair_comes_as_soon_as_nothing_can_better_it(left):
     assert [result.scan.on_bus_ns for result in first] == [0, 3_000_000] and len(taken) == 3
 
 
-def test_results_that_come_late_in_one_lump_are_paired_all_the_same():
+def test_results_that_come_late_and_together_are_still_paired():
     left, right = range(0, 2000, 10), range(3, 2000, 10)
     results = [*results_at(left=left), *results_at(right=right)]
     assert pairs_ms(results, "left", "right") == list(zip(left, right, strict=True))

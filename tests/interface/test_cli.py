@@ -30,7 +30,7 @@ from firmware_bridge.zeroing.baseline import load_baselines
 __all__ = ["files"]
 
 
-def test_a_sensor_gets_the_model_of_one_tap_unless_asked_and_the_demo_that_of_poses(tmp_path):
+def test_a_sensor_gets_one_taps_model_and_the_demo_that_of_poses(tmp_path):
     recording = write_counts(tmp_path / "rest.csv", np.full((3, 3, 4, 4), 30_000))
     for name, model in ((f"replay:{recording}", "stsr-int8"), ("demo", "mtsr-int8")):
         done = run("--source", name, "--rate-hz", "100", "--duration-s", "0.5", "--sink", "jsonl:-")
@@ -145,11 +145,11 @@ def test_a_refusal_is_one_line_with_its_code_and_all_files_stay(code, typed, wor
         (["--sink", "zenoh:a//b"], ["'a//b'", "words with '/' between"]),
     ],
 )
-def test_fields_and_sinks_that_cannot_be_are_2_before_anything_is_opened(command, wrong, words):
+def test_impossible_fields_and_sinks_are_2_before_anything_opens(command, wrong, words):
     assert_refused(run(*command, "--model", "none", *wrong), 2, *words)
 
 
-def test_without_source_several_adapters_are_3_and_nothing_is_emulated(plugged, capsys):
+def test_several_adapters_without_source_are_3_and_not_emulated(plugged, capsys):
     ports = ["/dev/ttyUSB0", "/dev/ttyUSB1"]
     plugged += [Port(path, (0x0403, 0x6015), f"S{path[-1]}", "adapter") for path in ports]
     plugged.append(Port("/dev/ttyS9", None, None, "n/a"))
@@ -186,7 +186,7 @@ def test_of_a_recording_a_few_free_scans_are_enough(tmp_path):
     assert np.abs(free.counts - zero.counts).max() < 5
 
 
-def test_a_baseline_of_a_recording_that_may_be_of_a_held_pad_is_in_doubt(tmp_path):
+def test_the_baseline_of_a_pad_that_may_be_held_is_in_doubt(tmp_path):
     done = run("replay", write_recording(tmp_path / "held.npz", [*[400] * 60, *[0] * 110]))
     assert "sensor 4 has no pattern to be believed: baseline in doubt: taken from this recording" in done.stderr
 
@@ -265,7 +265,7 @@ class TestEnds:
         assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
         assert last.startswith(f"edge-sr: {emulator.port}: link lost")
 
-    def test_a_model_that_does_not_exist_ends_before_the_link_is_opened(self, emulator, capsys):
+    def test_a_missing_model_ends_before_the_link_is_opened(self, emulator, capsys):
         """A link that is slow to open would hold up the message."""
         received = []
         emulator.adapter.feed = lambda data: received.append(data) or b""
@@ -279,7 +279,7 @@ class TestEnds:
         assert done.returncode == 4 and "broken.onnx: not a model" in done.stderr
         wait_for(lambda: not emulator.adapter.channel_open)
 
-    def test_a_port_that_never_speaks_is_told_of_with_what_to_do_and_is_3(self, files):
+    def test_a_port_that_never_speaks_is_3_with_what_to_do(self, files):
         leader, follower = pty.openpty()
         name = f"slcan:{os.ttyname(follower)}"
         done = run(*base_options(files), "--source", name, "--duration-s", "6")
@@ -327,7 +327,7 @@ def test_a_stdout_that_takes_nothing_is_5_in_one_line(command, redirection, why,
 
 
 @pytest.mark.parametrize("redirection", ["2>/dev/full", "<&- 2>&-"])
-def test_without_a_stderr_there_are_records_on_stdout_and_nothing_else(files, redirection):
+def test_without_a_stderr_stdout_has_records_and_nothing_else(files, redirection):
     options = [*base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-"]
     done = in_shell(redirection, *options, unbuffered=False)
     assert done.returncode == 0 and done.stderr == ""

@@ -247,7 +247,7 @@ def terminal(tmp_path, long):
     shell.close()
 
 
-def test_keys_zero_and_the_terminal_is_given_back_where_it_stops_and_ends(terminal):
+def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     assert b"keys: r forgets earlier taps, z zeroes" in terminal.shown
     terminal.type("z")
     terminal.until(lambda: any("zeroing refused: sensor 4 is in contact" in event for event in terminal.events()))

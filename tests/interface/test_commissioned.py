@@ -81,7 +81,7 @@ def test_a_baseline_of_another_order_is_refused(file, pressed, tmp_path):
         first(pressed, baselines=tmp_path / "placed.json")
 
 
-def test_what_is_asked_for_goes_before_the_file_but_for_another_id_map(file, pressed, tmp_path):
+def test_options_go_before_the_file_but_for_another_id_map(file, pressed, tmp_path):
     newer = Baseline.of("4", REST + 5, 2000.0, 100, "file")
     save_baselines(tmp_path / "zero.json", [newer], {"4": TURNED.order})
     result = first(pressed, file, "XR1944", baselines=tmp_path / "zero.json", counts_per_newton=900)

@@ -55,7 +55,7 @@ def made(tmp_path) -> tuple[Path, list[Result]]:
     return path, results
 
 
-def test_arrays_hold_every_scan_with_its_result_maps_baseline_and_poses(made):
+def test_arrays_hold_scans_results_maps_baselines_and_poses(made):
     path, results = made
     arrays = arrays_of(path)
     results = sorted(results, key=lambda one: one.scan.time_ns)
@@ -96,7 +96,7 @@ def test_each_key_of_a_record_is_an_array_or_is_named_as_left_out(made, capsys):
         assert name in left_out and name in table
 
 
-def test_maps_that_an_earlier_release_recorded_as_images_are_converted_alike(made, tmp_path):
+def test_an_earlier_releases_maps_as_images_are_converted_alike(made, tmp_path):
     path, _ = made
     with path.open("rb") as file, (tmp_path / "old.mcap").open("wb") as old:
         writer = Writer(old)
@@ -120,7 +120,7 @@ def test_maps_that_an_earlier_release_recorded_as_images_are_converted_alike(mad
     assert all((new[field.name] == old[field.name]).all() for field in MAPS if field.name in new)
 
 
-def test_scans_poses_mountings_and_baselines_survive_the_way_there_and_back(made, tmp_path):
+def test_scans_poses_and_baselines_survive_the_way_out_and_back(made, tmp_path):
     path, _ = made
     before = load_recording(path)
     for name in ("1.npz", "2.mcap", "3.npz"):
@@ -137,7 +137,7 @@ def test_scans_poses_mountings_and_baselines_survive_the_way_there_and_back(made
         assert before.poses == after.poses != []
 
 
-def test_a_csv_has_the_order_of_the_id_map_and_what_is_missing_is_said(made, tmp_path, capsys):
+def test_a_csv_has_the_id_maps_order_and_says_what_is_missing(made, tmp_path, capsys):
     path, results = made
     assert convert(path, tmp_path / "press.csv") == 0
     out = capsys.readouterr().out

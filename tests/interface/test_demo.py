@@ -60,7 +60,7 @@ def play(recording, *, lost=(), option=False, model=None):
     return score
 
 
-def test_each_tap_is_scored_at_its_peak_against_that_frames_truth(recording):
+def test_each_tap_is_scored_at_its_peak_by_that_frames_truth(recording):
     score = play(recording)
     first, second = score.scores()
     assert (first.tap, first.pose, second.tap, second.pose) == (0, (0, 0, 0), 1, (0, 0, -5))
@@ -79,7 +79,7 @@ def test_a_lost_scan_shifts_nothing(recording):
     assert gappy[0].result.scan.number != whole[0].result.scan.number
 
 
-def test_a_tap_that_is_played_in_place_of_another_has_its_own_truth_and_pose(recording):
+def test_a_tap_in_place_of_another_has_its_own_truth_and_pose(recording):
     model = FakeModel()
     score = play(recording, option=True, model=model)
     first, second = score.scores()
@@ -118,7 +118,7 @@ def test_each_scene_is_announced_and_then_told_how_it_went(recording, tmp_path):
     assert len(told_of_scenes(results[:7], tmp_path / "scenes.npz")) == 3, "a scene that is cut off has no outcome"
 
 
-def test_the_bundled_model_drops_the_foreign_tap_and_flags_the_magnet():
+def test_the_bundled_model_drops_foreign_taps_and_flags_a_magnet():
     runtime = Runtime(load_model(POSED_MODEL), source="emulated", options=RuntimeOptions(every_scan=True))
     series = ScanSeries("4", USPA44)
     with np.load(demo_recording()) as demo:
@@ -154,7 +154,7 @@ def posed(tmp_path_factory):
     return str(path)
 
 
-def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_tap(posed, tmp_path, capfd):
+def test_a_looping_demo_is_scored_once_and_begins_each_pass_anew(posed, tmp_path, capfd):
     """The demo's own scans, twice, from a link that waits for its reader: no machine is too slow for it."""
     with np.load(demo_recording()) as demo:
         tap_of, counts = demo["tap"], demo["counts"].astype(np.int32)
@@ -213,7 +213,7 @@ def taps_of(results):
     return [*takewhile(lambda tap: tap.place[2] > -20, taps)]  # the turn of the first one after the figure's
 
 
-def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(posed):
+def test_the_robots_proposed_taps_and_its_slide_are_both_scored(posed):
     """The whole program with a model that takes poses: each proposal of its records is where the next tap is made."""
     # At its own rate: faster, a busy machine loses scans in the kernel, and with them the zeroing before the first tap.
     done = cli_samples.run("demo", "--model", posed, "--sink", "jsonl:-")

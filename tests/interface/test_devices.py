@@ -43,7 +43,7 @@ def test_serial_ports_and_what_to_write_for_them():
     assert (other.usb_id, other.source, other.looks_like) == (None, "slcan:/dev/ttyS0", "n/a: no known adapter")
 
 
-def test_ports_that_share_a_serial_number_are_named_by_path_and_may_not_be_permitted():
+def test_ports_that_share_a_serial_number_are_named_by_path():
     second = VSCOM._replace(path="/dev/ttyUSB1", interface="1.1")
     found = serial_devices([VSCOM, second], may_open=lambda path: path == VSCOM.path)
     assert [one.source for one in found] == ["slcan:/dev/ttyUSB0", "slcan:/dev/ttyUSB1"]

@@ -194,7 +194,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("words", WRONG)
-def test_the_gripper_neither_begins_nor_goes_on_by_a_reading_that_is_no_ground(at_once, words):
+def test_the_gripper_neither_begins_nor_goes_on_by_a_bad_reading(at_once, words):
     grip, gripper = grip_of(at_once, oldest_ms=2000)
     grip.follow(reading(**WRONG[words]))
     assert gripper.done == [] and grip.why.startswith("it never began: ") and words in grip.why
@@ -205,7 +205,7 @@ def test_the_gripper_neither_begins_nor_goes_on_by_a_reading_that_is_no_ground(a
     assert gripper.done == ["close", "stop"] and words in grip.why and not grip.reached
 
 
-def test_it_begins_when_every_sensor_is_free_and_any_one_stops_it(stop_on_area):
+def test_it_begins_when_every_sensor_is_free_and_any_stops_it(stop_on_area):
     grip, gripper = grip_of(stop_on_area, oldest_ms=20_000)
     grip.follow(reading(sensor="left", age_ms=1000))
     grip.follow(reading(sensor="left", age_ms=600))
@@ -221,7 +221,7 @@ def test_it_begins_when_every_sensor_is_free_and_any_one_stops_it(stop_on_area):
     assert gripper.done == ["close", "stop"] and grip.reached
 
 
-def test_a_sensor_that_falls_silent_stops_it_though_the_other_is_heard(at_once, monkeypatch):
+def test_a_silent_sensor_stops_it_though_the_other_still_sends(at_once, monkeypatch):
     grip, gripper = grip_of(at_once, oldest_ms=2000)
     for age_ms in (1000, 900):
         for sensor in ("left", "right"):

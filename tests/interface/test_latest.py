@@ -43,7 +43,7 @@ def stream_of(source, **settings):
     return Stream(source, open_runtime(settings.pop("model", FakeModel()), source, baselines=BASELINES), **settings)
 
 
-def test_it_is_the_newest_and_what_it_passed_over_is_counted_and_kept():
+def test_it_is_the_newest_and_skipped_scans_are_counted_and_kept():
     link, sink = StagedLink(scans(*range(7)), scans(7), endless=True), ListSink()
     waits_s, later_ns = set(), [make_scan(6).time_ns + 5_000_000]
     with Source(link) as source:
@@ -258,7 +258,7 @@ def test_asyncio_is_told_of_errors_and_of_time():
     assert asyncio.run(main()) == threading.active_count()
 
 
-def test_a_name_that_no_sensor_has_is_refused_once_all_of_its_link_were_heard():
+def test_an_unknown_name_is_refused_once_its_link_was_heard():
     """A sensor may still come before; one of another link, or with a baseline, at any time."""
     left = StagedLink(scans(0), scans(*range(1, 20)), endless=True, prefix="a/")
     right = StagedLink(scans(0), endless=True, prefix="b/")
@@ -279,7 +279,7 @@ def test_a_name_that_no_sensor_has_is_refused_once_all_of_its_link_were_heard():
             next(paired(stream, ["a/4", "a/5"]))
 
 
-def test_what_is_asked_of_a_sensor_that_there_is_not_is_refused_in_a_line():
+def test_a_command_to_a_missing_sensor_is_refused_in_a_line():
     """A pose waits until all sensors of its link were heard; a command is for those that were heard so far."""
     link, commands, sink = StagedLink(scans(0), scans(*range(1, 20)), scans(20), endless=True), Commands(), ListSink()
     with Source(link) as source:

@@ -53,7 +53,7 @@ def camera_of(plugin, **settings):
     return make_cameras_from_configs({"tactile": config})["tactile"]
 
 
-def test_it_reads_an_emulated_sensor_as_a_robot_reads_its_cameras(plugin):
+def test_it_reads_an_emulated_sensor_as_a_robot_reads_a_camera(plugin):
     camera = camera_of(plugin, source="demo:loop", pretend=True, width=80, height=80)
     with pytest.raises(ConnectionError, match=r"is not connected"):
         camera.async_read()
@@ -120,7 +120,7 @@ def test_what_is_no_sensor_is_refused_unless_one_pretends(plugin):
         camera_of(plugin, window_scans=0)
 
 
-def test_images_have_a_fixed_range_and_say_where_they_are_not_to_be_believed(plugin):
+def test_images_have_a_fixed_range_and_mark_what_is_not_believed(plugin):
     observation = importlib.import_module("lerobot_camera_tactile_sr.observation")
     pressed, free = make_wrench_result(), make_wrench_result(press_counts=0)
     contract = make_contract(traction_scale=2)

@@ -111,7 +111,7 @@ class TestIntake:
         assert step(200, pose(1)) == ([], [], 3)
         assert "poses_trouble" in [kind for kind, *_ in step(100 + REPEATED_NS, pose(2))[1]], "after a while again"
 
-    def test_a_source_that_falls_silent_is_reported_once_and_when_it_is_back(self, step):
+    def test_a_silent_source_is_reported_once_and_when_it_is_back(self, step):
         assert step(10**12)[1] == [], "without any pose there is nothing to miss"
         step(0, pose(1), pose(2, sensor="4"), pose(1, sensor="6", holds=True))
         assert step(SENSOR_SILENT_NS, pose(3, sensor="4"))[1] == []
@@ -143,7 +143,7 @@ class PoseSink(ListSink):
         ({"states_poses": True}, "its scans are of a recording, which has poses of its own"),
     ],
 )
-def test_poses_come_to_the_sinks_before_the_scans_that_they_serve(of_link, why):
+def test_poses_reach_the_sinks_before_the_scans_that_they_serve(of_link, why):
     commands, sink, statistics = Commands(), PoseSink(), Statistics()
     commands.poses.put(pose(1, 7.0))
     link = FakeLink([[make_scan(0)], [make_scan(1)]])

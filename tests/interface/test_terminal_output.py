@@ -109,7 +109,7 @@ def test_nothing_without_a_terminal_or_beyond_torchruns_first(terminal, monkeypa
     assert pipe.getvalue() == terminal.said() == ""
 
 
-def test_zeroing_shows_its_bar_and_leaves_no_trace_when_it_is_stopped(tmp_path, limits, terminal):
+def test_zeroing_shows_its_bar_and_leaves_no_trace_when_stopped(tmp_path, limits, terminal):
     """`edge-sr baseline` for an hour of scans, stopped by Ctrl-C."""
     limits(progress_bar, DELAY_S=0)
     said = []

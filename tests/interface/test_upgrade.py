@@ -108,7 +108,7 @@ def played(folder, *arguments):
     return [one for one in records(done.stdout) if one["state"] != "event"], done.stderr
 
 
-def test_the_remedy_for_a_recording_that_is_held_throughout_works_as_it_is_printed(folder):
+def test_the_printed_remedy_for_a_recording_of_a_held_pad_works(folder):
     held = write_parts(folder / "monday" / "left.csv", *moving(150))
     released = write_parts(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
     shown, stderr = played(folder, held, "--rate-hz", "60")
@@ -125,7 +125,7 @@ def test_the_remedy_for_a_recording_that_is_held_throughout_works_as_it_is_print
     assert {one["state"] for one in shown[:89]} == {"contact"} and {one["state"] for one in shown[95:]} == {"idle"}
 
 
-def test_a_baseline_of_a_recording_is_as_old_as_the_recording_or_of_unknown_age(folder):
+def test_the_age_of_a_recordings_baseline_is_unknown(folder):
     path = write_parts(folder / "left.csv", (120, 0))
     for more in ([], ["--skip", "5", "--scans", "100"]):
         arguments = ["--source", f"replay:{path}", "--rate-hz", "600", *more, "--out", folder / "zero.json"]

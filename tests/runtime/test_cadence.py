@@ -220,5 +220,5 @@ def test_rest_is_a_second_without_contact():
         (ReadingPace(), 9, "contact", {"sensors": 4, "period_ms": 100}),
     ],
 )
-def test_rest_needs_stamps_and_a_usual_rate_and_four_are_read_together(pace, scans, state, settings):
+def test_rest_needs_stamps_and_rate_and_four_are_read_together(pace, scans, state, settings):
     assert rest(scans, state, **settings).pace == pace

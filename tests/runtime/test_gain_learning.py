@@ -177,7 +177,7 @@ class TestStage:
         assert check.suspected == contradicted == len(suspected)
         assert not contradicted or ("another sensor's file" in suspected[0] and events[-1][0] == "suspected")
 
-    def test_what_was_learned_before_is_used_at_first_and_is_no_beginning(self):
+    def test_gains_learned_before_stay_until_new_ones_are_as_certain(self):
         learned = taught(draw_contacts(120, draw_gains())).pad()
         learn, pad, _ = learning_of(None, learned)
         for contact in draw_contacts(60, draw_gains(), seed=5):

@@ -108,7 +108,7 @@ def test_free_memory_between_used_blocks_is_given_back():
 NOTHING_INSTALLED = [sys.executable, "-E", "-S"]
 
 
-def test_from_the_sources_their_folder_is_named_and_from_a_wheel_its_name(tmp_path):
+def test_the_sources_name_their_folder_and_a_wheel_its_name(tmp_path):
     assert how_to_install("zenoh") == f"pip install '{ROOT}[zenoh]'"
     (tmp_path / "firmware_bridge").mkdir()
     shutil.copy(ROOT / "firmware_bridge/errors.py", tmp_path / "firmware_bridge")

@@ -44,7 +44,7 @@ class TestResult:
         assert result.deviation is not None and result.interval_mm is result.centroid_mm is None
         assert result.area_mm2 == 0
 
-    def test_the_patch_is_weighted_and_leaves_out_what_is_below_the_level(self):
+    def test_the_patch_is_weighted_and_has_no_points_below_the_level(self):
         pattern = np.zeros((40, 40), dtype=np.float32)
         pattern[1, [0, 1, 3]] = 0.49, 0.5, 1.0
         centroid_mm = (1 * 0.5 + 3 * 1.0) / 1.5 * 2 - 39, -37

@@ -230,7 +230,7 @@ class TestEnds:
     @pytest.mark.parametrize(
         ("error", "words"), [(LinkLostError("gone"), "gone"), (ZeroDivisionError(), "unforeseen ZeroDivisionError")]
     )
-    def test_a_lost_link_or_a_fault_in_it_is_told_after_all_scans_before(self, error, words):
+    def test_a_lost_or_faulty_link_is_reported_after_earlier_scans(self, error, words):
         sink, statistics = ListSink(), Statistics()
         with pytest.raises(LinkLostError, match=words):
             pumped(FakeLink([presses([0, 1]), presses([2])], error=error), sink, statistics=statistics)

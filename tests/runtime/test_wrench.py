@@ -82,7 +82,7 @@ def press():
     return Balance(forward, USPA44), pattern, traction, readings, row, drag_n
 
 
-def test_force_in_a_contact_changes_as_its_readings_do_whatever_the_network_finds(press):
+def test_force_follows_the_readings_whatever_the_network_finds(press):
     balance, pattern, traction, readings, row, drag_n = press
     level_n = wrench_of(traction, CELL_MM).force_n[2]
     for number, (strength, off) in enumerate([(1.0, 1.0)] * 40 + [(1.0, 1.1), (1.2, 0.8), (0.8, 1.3)]):
@@ -155,7 +155,7 @@ def test_a_record_states_how_far_its_newtons_may_be_off(settings, expected):
     assert made.wrench_origin == ("calibrated" if settings else "nominal")
 
 
-def test_counts_per_newton_that_are_hardly_known_are_not_given_to_the_model():
+def test_uncertain_counts_per_newton_are_not_given_to_the_model():
     wide = make_wrench_result(counts_per_newton={"4": 1500.0}, scale_intervals={"4": (900.0, 2100.0)})
     assert (wide.wrench_origin, wide.scale_error) == ("nominal", pytest.approx(0.45))
 
@@ -176,7 +176,7 @@ def disc(x_mm, y_mm, radius_mm, depth_mm=1.0):
     return depth_mm * (np.hypot(X_MM - x_mm, Y_MM - y_mm) <= radius_mm)
 
 
-def test_two_contacts_have_areas_centres_and_their_shares_of_the_force():
+def test_two_contacts_have_areas_centres_and_shares_of_the_force():
     traction = np.zeros((3, 8, 8), dtype=np.float32)
     traction[2, :, :4], traction[2, :, 4:], traction[0, :, 4:] = 2, 6, 3
     big, small = patches(result_of(disc(5, 0, 3) + disc(-5, 1, 2), traction, trusted=True), CONTRACT)

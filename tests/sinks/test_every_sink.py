@@ -70,7 +70,7 @@ def test_one_that_ends_without_a_result_leaves_nothing_behind(opened, tmp_path):
 
 
 @pytest.mark.parametrize("kind", [Jsonl, Mcap])
-def test_counters_come_once_a_second_and_with_the_record_in_which_one_changes(kind, tmp_path):
+def test_counters_come_once_a_second_and_where_losses_change(kind, tmp_path):
     opened, (first, *_) = kind(tmp_path), make_sure_results(1)
     losses = (0, 0, 2, 2, 2, 2, 2)
     times_ns = (0, PERIOD_NS, 2 * PERIOD_NS, 3 * PERIOD_NS, COUNTED_NS, COUNTED_NS + 2 * PERIOD_NS, 5)  # played again
@@ -113,7 +113,7 @@ def full(tmp_path: Path) -> Sink:
 
 
 @pytest.mark.parametrize("bad", [full, gone])
-def test_a_sink_that_fails_leaves_the_others_going_and_each_hears_of_it(bad, tmp_path):
+def test_a_failing_sink_is_reported_and_the_others_go_on(bad, tmp_path):
     events: list[Event] = []
     fan, good = Fan(events.append, lambda: 11), ListSink()
     for sink in (bad(tmp_path), good):
@@ -129,7 +129,7 @@ def test_a_sink_that_fails_leaves_the_others_going_and_each_hears_of_it(bad, tmp
     assert event.kind == "sink" and event.text.endswith("; the other sinks continue") and good.events == events
 
 
-def test_the_failure_of_the_last_one_ends_the_run_and_a_reader_that_goes_is_an_ordinary_end(tmp_path):
+def test_the_last_sinks_failure_or_its_readers_end_ends_the_run(tmp_path):
     for failing, kind in ((full(tmp_path), SinkError), (gone(tmp_path), SinkClosedError)):
         fan = Fan(lambda event: None)
         fan.add(failing)
@@ -162,7 +162,7 @@ def test_the_failure_of_the_last_one_ends_the_run_and_a_reader_that_goes_is_an_o
         ),
     ],
 )
-def test_what_cannot_be_opened_is_refused_in_one_line_and_nothing_is_lost(text, error, words, tmp_path, monkeypatch):
+def test_a_sink_that_cannot_open_is_one_line_and_nothing_is_lost(text, error, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("taken.mcap").write_text("mine")
     os.mkfifo("fifo")
@@ -212,7 +212,7 @@ class TestFan:
             if self.error is not None:
                 raise self.error
 
-    def test_trouble_that_lasts_is_told_once_and_again_when_it_comes_back(self):
+    def test_lasting_trouble_is_told_once_and_again_when_it_returns(self):
         class Troubled(ListSink):
             trouble = None
 
@@ -240,7 +240,7 @@ class TestFan:
         assert good.waits == 2 and bad.closed and [event.kind for event in good.events] == ["sink"]
         assert good.told_counters == [RUN]  # and of what was counted nothing is forgotten
 
-    def test_what_ended_the_run_is_told_rather_than_a_sink_that_failed_before(self):
+    def test_the_runs_own_end_is_raised_not_an_earlier_sinks_failure(self):
         fan = Fan(lambda event: None)
         for sink in (self.Failing(SinkError("disk full")), ListSink()):
             fan.add(sink)

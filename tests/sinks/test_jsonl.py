@@ -22,7 +22,7 @@ from firmware_bridge.scans.scan import VendorReading
 
 
 class TestJsonLines:
-    def test_what_is_written_is_each_result_in_itself_however_patterns_are_given_again(self, tmp_path):
+    def test_each_result_is_written_whole_though_patterns_repeat(self, tmp_path):
         """A repeated pattern is the same array, of one sensor; others, and scans without one, come between."""
         baselines = {name: replace(BASELINE, sensor=name) for name in ("4", "6")}
         runtime = Runtime(FakeModel(make_contract(interval_factor=1.6)), source="device", baselines=baselines)
@@ -46,7 +46,7 @@ class TestJsonLines:
             ("trusted,temperature_k", set()),  # a field that is left out where it is unknown
         ],
     )
-    def test_a_record_holds_the_fields_that_are_named_and_what_a_robot_must_see(self, chosen, more, tmp_path):
+    def test_a_record_holds_named_fields_and_what_a_robot_must_see(self, chosen, more, tmp_path):
         whole, path = make_sure_results()[6], tmp_path / "out.jsonl"
         sink = open_sink(f"jsonl:{path}", CONTRACT, fake_source(), fields=chosen)
         sink.write(whole, RUN)
@@ -102,7 +102,7 @@ class TestJsonLines:
         told |= {"note": "the cable is out", "counters": {"scans": 3, "unwritten": 0}}
         assert json.loads((tmp_path / "out.jsonl").read_text()) == told
 
-    def test_a_slow_reader_holds_up_nothing_and_what_it_missed_is_counted(self, tmp_path):
+    def test_a_slow_reader_holds_up_nothing_and_its_loss_is_counted(self, tmp_path):
         """Every record is written or counted, and each that is written is whole."""
         fifo = tmp_path / "fifo"
         os.mkfifo(fifo)
@@ -120,7 +120,7 @@ class TestJsonLines:
         sink.close()
         os.close(reader)
 
-    def test_a_pipe_that_is_smaller_than_a_record_still_takes_it_from_a_reader_that_keeps_up(self, tmp_path):
+    def test_a_pipe_smaller_than_a_record_has_room_while_it_is_empty(self, tmp_path):
         read_end, write_end = os.pipe()
         fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
         assert has_room(write_end, 25_000)

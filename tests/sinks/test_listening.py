@@ -49,7 +49,7 @@ def reachable(process_id: int) -> list[str]:
     return found
 
 
-def test_a_running_demo_can_be_reached_only_where_the_test_opened_a_socket_itself():
+def test_a_running_demo_listens_on_no_socket_of_its_own():
     """Planted sockets show that those of the demo would be seen."""
     command = [sys.executable, "-c", RUN, "tcp", "0.0.0.0", "tcp", "127.0.0.1", "udp", "0.0.0.0"]
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}

@@ -162,7 +162,7 @@ class TestRos2:
         pose = used([last], "4", last.time_ns)
         assert (pose.y_mm, pose.error_mm, pose.error_deg) == (-500.0, 0.2, 1.0)
 
-    def test_the_covariance_comes_as_errors_and_a_transform_on_the_same_topic(self, opened, publish):
+    def test_a_covariance_is_errors_and_transforms_share_its_topic(self, opened, publish):
         queue = opened("ros2:arm/pose")
         covariance = [0.0] * 36
         covariance[0] = covariance[7] = 1e-6
@@ -222,7 +222,7 @@ class TestToolFrame:
         assert (got.error_mm, got.error_deg) == (PLACE_ERROR_MM, TURN_ERROR_DEG)
 
     @pytest.mark.parametrize("up", [FLIPPED, UP])
-    def test_a_feature_of_the_object_keeps_its_place_however_the_pad_lies_on_it(self, up):
+    def test_a_feature_of_the_object_stays_as_the_pad_moves_on_it(self, up):
         """A point of the object, seen from two poses of the pad, in the axes of a pattern: x right, y down."""
         rng, point = np.random.default_rng(3), np.array([0.003, -0.002, 0.0])
         seen = []
@@ -271,7 +271,7 @@ class TestStampClock:
         return [clock.monotonic_ns(stamp, arrival_ns) for stamp, arrival_ns in stamped], lines
 
     @pytest.mark.parametrize("delay_ns", [-EARLY_NS, 0, 30_000_000, LATE_NS])
-    def test_where_clocks_agree_a_stamp_is_the_time_and_a_delay_stays(self, delay_ns):
+    def test_where_clocks_agree_a_stamp_is_the_time_and_delay_stays(self, delay_ns):
         arrival_ns = 10**12
         got = self.times_ns((self.OFFSET_NS + arrival_ns - delay_ns, arrival_ns))
         assert got == ([arrival_ns - max(delay_ns, 0)], [])

@@ -74,7 +74,7 @@ class Talker:
             self.wrote[sensor, result.scan.device_ns + self.sink.unix_offset_ns] = result
 
 
-def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(sink):
+def test_subscribers_get_exact_patterns_and_hear_of_their_end(sink):
     """One session, for processes are dear: two sensors, contact, its end, an outage, and the end of it all."""
     with Listener(TOPICS) as listener:
         talker = Talker(sink)
@@ -216,7 +216,7 @@ def test_a_force_of_which_a_part_is_not_known_is_no_wrench(sink):
     assert ros_messages.force_and_torque(replace(result, scan=scan, force_n=2.0), pad_of(3, 3)) is None, "no places"
 
 
-def test_force_torque_traction_and_numbers_of_a_model_with_traction(sink):
+def test_force_torque_and_numbers_of_a_model_with_traction(sink):
     published = []
     keep_published(sink, published, WRENCH, CLOUD, FLOAT)
     result = make_wrench_result()
@@ -234,7 +234,7 @@ def test_force_torque_traction_and_numbers_of_a_model_with_traction(sink):
     assert numbers == known | {"area_m2": result.area_mm2 / 1e6}
 
 
-def test_frames_of_the_sensor_file_reach_who_comes_late_and_commands_come_back():
+def test_frames_reach_late_readers_and_commands_come_back():
     frames = {"left": PadFrame("tool0", (0.0, 12.5, 50.0), (0.0, 1.0, 0.0, 0.0)), "far": PadFrame("base")}
     commands = Commands()
     sink = Ros2Sink("skin", make_contract(), fake_source(frames=frames), commands, environment=ENVIRONMENT)
@@ -279,7 +279,7 @@ def test_commands_are_taken_only_where_that_was_asked_for(text, listens, monkeyp
     assert bool(asked) is listens
 
 
-def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_dds_is():
+def test_a_node_that_describes_types_as_fast_dds_does_is_heard():
     """Cyclone DDS compares descriptions, and those of Fast DDS differ; here another Cyclone DDS stands for it."""
     fast_dds = "<IgnoreTypeInformation>1.15</IgnoreTypeInformation>"  # by the vendor's id in the protocol
     assert fast_dds in ros2_domain.configuration({})

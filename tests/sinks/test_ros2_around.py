@@ -57,7 +57,7 @@ def kept(kind="device", *, unix_offset_ns=None, **settings):
     return sink, published, clock
 
 
-def test_diagnostics_come_once_a_second_and_tell_of_silence_and_its_reason():
+def test_diagnostics_come_once_a_second_and_say_why_it_is_silent():
     sink, published, clock = kept()
     idle = Result(make_scan(1), "device", "m", "idle", contact=False, baseline=BASELINE, baseline_age_s=3.0)
 
@@ -118,7 +118,7 @@ def test_stamps_of_now_are_wall_time_by_the_clock_at_the_start():
     sink.close()
 
 
-def test_an_outage_of_one_link_takes_nothing_from_the_sensors_of_another():
+def test_one_links_outage_takes_nothing_from_sensors_of_another():
     sink, published, clock = kept()
     for name in ("left/4", "right/4"):
         sink.write(contact(1, sensor=name), {})
@@ -277,7 +277,7 @@ TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0")
 
 
 @given(TEXT, NUMBERS, TEXT)
-def test_whatever_stands_before_a_number_it_lies_where_cyclonedds_puts_it(a, c, g):
+def test_each_number_lies_where_cyclonedds_puts_it(a, c, g):
     values = {"a": a, "b": -3, "c": c, "d": 7, "e": 0.1, "f": [1, -2], "g": g}
     data = MIXED.encode(values)
     assert data == bytes(Mixed(**values).serialize())

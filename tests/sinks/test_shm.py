@@ -220,7 +220,7 @@ class TestReading:
             (192 + 64, 5000, 5),  # of a writer that was killed half-way in the other: the newest whole value stays
         ],
     )
-    def test_broken_memory_is_given_up_and_hides_nothing_that_is_whole(self, sink, name, at, broken, scan):
+    def test_broken_memory_is_given_up_and_hides_no_whole_scan(self, sink, name, at, broken, scan):
         sink.write(make_result(5), {})
         with Path("/dev/shm", name).open("r+b") as file:
             file.seek(at)
@@ -268,7 +268,7 @@ class TestReading:
             (["5"], "nothing to act on: no sensor 5, but left/4.*"),
         ],
     )
-    def test_the_example_prints_what_it_acts_on_until_the_memory_is_gone(self, name, start_writer, words, line):
+    def test_the_example_prints_what_it_acts_on_until_memory_is_gone(self, name, start_writer, words, line):
         start_writer()
         command = [sys.executable, str(ROOT / "examples" / "shm_read.py"), name, *words]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}

@@ -15,7 +15,7 @@ from edge.sinks.status_line import MessageSink, StatusSink
 
 
 @pytest.mark.parametrize(("stream", "start"), [(io.StringIO(), ""), (Terminal(), "\r\x1b[K")])
-def test_events_are_lines_and_what_others_wrote_does_nothing_to_the_terminal(stream, start):
+def test_events_are_lines_that_cannot_control_the_terminal(stream, start):
     messages = MessageSink(stream)
     messages.tell(Event(0, "trouble", None, "\x1b[2J\x9b\rpad\n\ud800 in µm"), {})
     told = tuple(Event(1, "refused", None, text) for text in ("zeroing refused", "zeroed; again"))
@@ -35,7 +35,7 @@ def test_what_knows_no_escape_sequences_gets_none(monkeypatch, stream, term):
     assert stream.getvalue() == "edge-sr: the cable is out\n"
 
 
-def test_what_to_do_is_said_ever_more_seldom_until_the_first_scan():
+def test_the_hint_comes_ever_more_seldom_until_the_first_scan():
     stream, now_s = io.StringIO(), [0.0]
     messages = MessageSink(stream, hint=lambda: "is it powered?", clock_s=lambda: now_s[0])
     for now_s[0] in np.arange(0, 60, 0.5):
@@ -48,7 +48,7 @@ def test_what_to_do_is_said_ever_more_seldom_until_the_first_scan():
     assert stream.getvalue().splitlines() == hints
 
 
-def test_a_pattern_that_is_not_believed_is_told_of_once_a_contact():
+def test_a_pattern_not_to_be_believed_is_reported_once_a_contact():
     stream = io.StringIO()
     messages = MessageSink(stream)
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
@@ -91,9 +91,7 @@ class TestStatus:
             (4, " .."),
         ],
     )
-    def test_the_line_says_all_of_it_and_on_a_narrow_terminal_fewer_words_and_none_cut(
-        self, columns, line, monkeypatch
-    ):
+    def test_a_narrow_terminals_line_has_fewer_words_and_none_cut(self, columns, line, monkeypatch):
         monkeypatch.setenv("COLUMNS", str(columns))
         sink = self.make()
         ticks = iter(range(0, 10**9, 250_000))

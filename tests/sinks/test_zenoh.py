@@ -33,7 +33,7 @@ zenoh = pytest.importorskip("zenoh")
 
 
 class TestMessages:
-    def test_a_new_pattern_comes_with_all_its_maps_and_who_writes_comes_and_goes(self, endpoint, consume):
+    def test_a_new_pattern_has_all_its_maps_and_writers_come_and_go(self, endpoint, consume):
         """The rest of each result is in tests/sinks/test_every_sink.py."""
         consumer, results = consume(endpoint), make_results(40)
         sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source())
@@ -57,7 +57,7 @@ class TestMessages:
             for name, values in maps.items():
                 np.testing.assert_array_equal(values, getattr(result, name))
 
-    def test_a_run_that_nobody_reads_says_so_as_it_goes_and_at_its_end(self, endpoint, tmp_path, capsys):
+    def test_a_run_that_nobody_reads_says_so_as_it_goes_and_ends(self, endpoint, tmp_path, capsys):
         model = write_model(tmp_path / "tiny.onnx", CONTRACT)
         path = write_recording(tmp_path / "free.csv", np.stack([make_scan(n, noise=2).counts for n in range(150)]))
         source = ["--source", f"replay:{path}", "--rate-hz", "100", "--model", str(model)]
@@ -67,7 +67,7 @@ class TestMessages:
         told = capsys.readouterr().err
         assert f"edge-sr: {why}\n" in told and f"\nsinks: {why}\n" in told
 
-    def test_every_name_of_a_sensor_makes_a_key_of_its_own_and_is_told(self):
+    def test_every_sensor_name_makes_a_key_of_its_own_and_is_told(self):
         names = [
             "4",
             "left/4",
@@ -130,7 +130,7 @@ class TestWhoComesAndGoes:
             assert consumer.next()[0] == "went"
 
     @pytest.mark.parametrize("reader_goes", [True, False])
-    def test_the_example_tells_what_comes_and_ends_quietly_with_its_reader_and_with_ctrl_c(self, endpoint, reader_goes):
+    def test_the_example_ends_quietly_with_its_reader_or_with_ctrl_c(self, endpoint, reader_goes):
         command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", endpoint]
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         with ended(subprocess.Popen(command, **streams)) as listener:
@@ -202,7 +202,7 @@ def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
         sink.close()
 
 
-def test_a_replay_that_waits_for_a_peer_that_is_gone_ends_all_the_same(endpoint, consume, tmp_path):
+def test_a_replay_that_waits_for_a_stopped_peer_still_ends(endpoint, consume, tmp_path):
     """Five seconds are promised; a busy machine may take longer."""
     model, consumer = write_model(tmp_path / "tiny.onnx", CONTRACT), consume(endpoint)
     counts = make_scan(0).counts + np.random.default_rng(1).integers(-2, 3, (8000, 3, 4, 4))

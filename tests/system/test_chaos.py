@@ -108,7 +108,7 @@ def test_accounts_that_do_not_fit_are_seen(counters, why):
     assert (not judge.broken) if why is None else why in "; ".join(judge.broken), judge.broken
 
 
-def test_a_recording_is_played_among_faults_for_a_program_of_ones_own(tmp_path):
+def test_a_recording_is_played_among_faults_for_your_own_program(tmp_path):
     recording = make_recording(100)
     frames = bus_timeline(controllers_of([recording], 400), jitter_s=0.0, seed=1, loop=True)
     bus = FaultyBus(numbered(frames), stretches("lost=.5@0+60", 1), 1, tmp_path / "port")

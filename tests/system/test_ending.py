@@ -52,7 +52,7 @@ with stop_on_signals(), terminal_keys(Commands()):
 PIPES = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 
 
-def test_a_local_viewer_that_pings_and_does_not_read_holds_up_no_end():
+def test_a_viewer_that_pings_and_never_reads_holds_up_no_end():
     command = [sys.executable, "-c", NARROW, "--source", "demo:loop", "--view", "0"]
     with ended(subprocess.Popen(command, **PIPES)) as process:
         address = next(line for line in process.stderr if line.startswith(b"live page: "))
@@ -92,7 +92,7 @@ def test_a_full_pipe_that_nobody_reads_holds_up_no_end(tmp_path):
     assert "records left out for slow readers: 1" in words and "Traceback" not in words
 
 
-def test_a_model_that_never_returns_is_ended_by_force_and_gives_the_terminal_back():
+def test_an_endless_model_is_killed_and_the_terminal_restored():
     leader, follower = pty.openpty()
 
     def own_terminal():

@@ -88,7 +88,7 @@ def test_the_runtime_installs_without_the_training_libraries(fresh, demo):
     assert not NOT_IN_THE_RUNTIME & {package["name"].lower() for package in installed}
 
 
-def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
+def test_it_holds_the_runtime_alone_with_types_for_a_checker(fresh):
     (packages,) = fresh.parent.glob("lib/python*/site-packages")
     assert {path.name for path in packages.iterdir()} & OURS == IN_THE_WHEEL
     assert {path.parent.name for path in packages.glob("*/py.typed") if path.parent.name in OURS} == IN_THE_WHEEL
@@ -101,7 +101,7 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     }
 
 
-def test_every_module_of_it_can_be_imported_without_what_is_left_out(fresh, tmp_path):
+def test_its_modules_can_be_imported_without_what_is_left_out(fresh, tmp_path):
     program = """
 import importlib, pkgutil, edge, firmware_bridge
 names = [one.name for package in (edge, firmware_bridge)

@@ -35,7 +35,7 @@ def contacts(mixture, count, gains, constants, seed):
     return (drawn * gains * rng.uniform(400, 700, (count, 1))).reshape(count, 3, 4, 4).astype(np.float32)
 
 
-def test_what_contacts_tell_is_found_and_the_rest_keeps_its_prior(mixture):
+def test_what_contacts_show_is_learned_or_else_the_prior_stays(mixture):
     log_gains = np.random.default_rng(1).normal(0, 0.075, (3, 16)).clip(-0.15, 0.15)
     log_gains = (log_gains - log_gains.mean(axis=1, keepdims=True)).ravel()
     constants = np.zeros(len(CONSTANTS))

@@ -133,7 +133,7 @@ def test_what_is_no_command_is_counted_and_told(message):
     assert why is not None and "expected {" in why and len(why) < 400 and "\n" not in why
 
 
-def test_where_nobody_polls_a_few_wait_and_the_others_are_refused():
+def test_where_nobody_polls_a_few_wait_and_others_are_refused():
     asked, why = executed(*[{"cmd": "reset"}] * (WAITING + 3))
     assert why.count(None) == WAITING and asked.refused == 3 and len(asked.poll()) == WAITING
     assert execute('{"cmd": "reset"}', Viewer(), asked) is None

@@ -104,7 +104,7 @@ def test_a_newcomer_gets_the_last_minute_thinned(heard, clock, rate_hz):
     assert [point[0] for point in header["trace"] if point[1] == 9000.0] == [round(spike / rate_hz, 3)]
 
 
-def test_who_was_away_long_gets_what_was_missed_thinned_and_nothing_twice(heard, clock):
+def test_a_viewer_long_away_gets_thinned_scans_and_nothing_twice(heard, clock):
     press, viewer = Press(), Viewer()
     heard.write(press.next(0), {})
     look(viewer, heard, clock)
@@ -127,7 +127,7 @@ def test_memory_does_not_grow_with_the_run(heard):
     assert len(heard.points("4", 0)) <= TRACE_POINTS and len(heard.events(0)) == EVENTS
 
 
-def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, clock):
+def test_events_come_once_and_a_newcomer_gets_the_latest(heard, clock):
     viewer = Viewer()
     for number in range(EVENTS + 5):
         heard.tell(Event(number, "lost", None, f"gone {number}"), {"outages": number})

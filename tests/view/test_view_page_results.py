@@ -283,7 +283,7 @@ def proxy(port, *, below="/edge/", host=None, sockets=True):
         ({"sockets": None}, None, "", "answers 502 for /edge/ws, and not edge-sr"),
     ],
 )
-def test_through_a_proxy_the_page_finds_its_socket_or_shows_why_not(open_page, settings, token, query, words):
+def test_behind_a_proxy_a_page_finds_its_socket_or_says_why_not(open_page, settings, token, query, words):
     with live_page(token=token) as view, proxy(view.port, **settings) as url:
         page = open_page(url + query)
         if words is not None:

@@ -96,7 +96,7 @@ class TestFrames:
 
 
 class TestAsked:
-    def test_a_message_that_is_too_long_ends_its_own_connection_alone(self, page):
+    def test_a_message_that_is_too_long_ends_its_connection_alone(self, page):
         with page.viewer() as viewer, page.viewer() as other:
             viewer.send("x" * 5000)
             with pytest.raises(ConnectionClosed) as caught:

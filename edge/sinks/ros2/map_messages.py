@@ -78,7 +78,7 @@ def grid(name: str, values: NDArray[np.float32], frame: str, unix_ns: int, geome
             "cell_size": {"x": pitch_m, "y": pitch_m},
             "row_stride": 4 * count * width,
             "cell_stride": 4 * count,
-            "fields": [{"name": one, "offset": 4 * at, "type": _FLOAT32} for at, one in enumerate(names)],
+            "fields": [{"name": field, "offset": 4 * at, "type": _FLOAT32} for at, field in enumerate(names)],
             "data": np.ascontiguousarray(in_si(name, layers).transpose(1, 2, 0), dtype="<f4").view(np.uint8),
         }
     )
@@ -90,29 +90,29 @@ def recorded_map(schema: str, data: bytes | memoryview) -> NDArray[np.float32]:
     Raises a CdrError where it is none of these, a ValueError where it is of other numbers.
     """
     if schema == GRID.name:
-        found = GRID.decode(data)
-        count, kinds = len(found["fields"]), {one["type"] for one in found["fields"]}
+        grid = GRID.decode(data)
+        count, kinds = len(grid["fields"]), {field["type"] for field in grid["fields"]}
         if kinds != {_FLOAT32}:
             raise ValueError(f"a grid of numbers of type {sorted(kinds)}, expected {_FLOAT32}, float32")
-        columns, strides = found["column_count"], (found["row_stride"], found["cell_stride"])
-        offsets = [one["offset"] for one in found["fields"]]
+        columns, strides = grid["column_count"], (grid["row_stride"], grid["cell_stride"])
+        offsets = [field["offset"] for field in grid["fields"]]
         wanted = (4 * count * columns, 4 * count)
         if (
             columns == 0
             or strides != wanted
             or offsets != list(range(0, 4 * count, 4))
-            or len(found["data"]) % wanted[0]
+            or len(grid["data"]) % wanted[0]
         ):
             raise ValueError(
                 f"a grid of {columns} columns, strides {strides}, fields at {offsets}: expected whole rows"
             )
-        layers = found["data"].view("<f4").reshape(-1, columns, count).transpose(2, 0, 1)
+        layers = grid["data"].view("<f4").reshape(-1, columns, count).transpose(2, 0, 1)
         return layers[0] if count == 1 else layers
-    found = IMAGE.decode(data)
-    if found["encoding"] not in ("32FC1", "32FC3") or found["is_bigendian"]:
-        raise ValueError(f"an image of encoding {found['encoding'][:20]!r}, expected 32FC1, little-endian")
-    values = found["data"].view("<f4").reshape(found["height"], found["width"], -1)
-    return values[..., 0] if found["encoding"] == "32FC1" else values.transpose(2, 0, 1)
+    message = IMAGE.decode(data)
+    if message["encoding"] not in ("32FC1", "32FC3") or message["is_bigendian"]:
+        raise ValueError(f"an image of encoding {message['encoding'][:20]!r}, expected 32FC1, little-endian")
+    values = message["data"].view("<f4").reshape(message["height"], message["width"], -1)
+    return values[..., 0] if message["encoding"] == "32FC1" else values.transpose(2, 0, 1)
 
 
 def taxels(scan: Scan) -> NDArray[np.float32]:
@@ -141,7 +141,7 @@ def points(result: Result, geometry: SensorGeometry, frame: str, unix_ns: int) -
     return _cloud(cloud, _POINT_FIELDS, frame, unix_ns)
 
 
-def contacts(found: Sequence[Patch], frame: str, unix_ns: int) -> bytes:
+def contacts(patches: Sequence[Patch], frame: str, unix_ns: int) -> bytes:
     """Return separate contacts as a cloud of a point each, the strongest first; without one, an empty cloud.
 
     The fields are float32: the middle x, y on the pad's face in [m], z 0; the force fx, fy, fz in [N], NaN where the
@@ -150,14 +150,14 @@ def contacts(found: Sequence[Patch], frame: str, unix_ns: int) -> bytes:
     rows = np.array(
         [
             [
-                *(place / 1e3 for place in (*one.centre_mm, 0.0)),
-                *(one.force_n or (math.nan,) * 3),
-                *one.normal,
-                one.area_mm2 / 1e6,
-                *(size / 1e3 for size in one.size_mm),
-                math.radians(one.long_axis_deg),
+                *(place / 1e3 for place in (*patch.centre_mm, 0.0)),
+                *(patch.force_n or (math.nan,) * 3),
+                *patch.normal,
+                patch.area_mm2 / 1e6,
+                *(size / 1e3 for size in patch.size_mm),
+                math.radians(patch.long_axis_deg),
             ]
-            for one in found
+            for patch in patches
         ],
         dtype="<f4",
     )

@@ -122,8 +122,8 @@ def force_and_torque(result: Result, geometry: SensorGeometry) -> tuple[Vector, 
         x, y, z = result.wrench.torque_n_mm
         return result.wrench.force_n, (x / 1e3, y / 1e3, z / 1e3)
     vendor = result.scan.vendor
-    known = result.scan.vendor_force_n is not None and result.scan.vendor_force_n[2] == result.force_n
-    if not known or vendor is None or vendor.newtons is None or math.isnan(geometry.pitch_mm):
+    is_vendors = result.scan.vendor_force_n is not None and result.scan.vendor_force_n[2] == result.force_n
+    if not is_vendors or vendor is None or vendor.newtons is None or math.isnan(geometry.pitch_mm):
         return None
     newtons = vendor.newtons.reshape(3, -1).T.astype(np.float64)
     places_m = np.pad(geometry.taxel_centres_mm() / 1e3, ((0, 0), (0, 1)))  # on the face
@@ -134,8 +134,8 @@ def force_and_torque(result: Result, geometry: SensorGeometry) -> tuple[Vector, 
 
 def wrench(result: Result, geometry: SensorGeometry, unix_ns: int) -> bytes | None:
     """Return force on the pad and torque as a message; None where a part of them is not available."""
-    known = force_and_torque(result, geometry)
-    return None if known is None else wrench_message(*known, frame_of(result), unix_ns)
+    force_torque = force_and_torque(result, geometry)
+    return None if force_torque is None else wrench_message(*force_torque, frame_of(result), unix_ns)
 
 
 def wrench_message(force_n: Vector, torque_n_m: Vector, frame: str, unix_ns: int) -> bytes:
@@ -151,7 +151,7 @@ def transforms(frames: Mapping[str, PadFrame], unix_ns: int) -> bytes:
             "header": header(pad.parent, unix_ns),
             "child_frame_id": child,
             "transform": {
-                "translation": dict(zip("xyz", (one / 1e3 for one in pad.place_mm), strict=True)),
+                "translation": dict(zip("xyz", (place / 1e3 for place in pad.place_mm), strict=True)),
                 "rotation": dict(zip("xyzw", pad.quaternion, strict=True)),
             },
         }

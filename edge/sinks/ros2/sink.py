@@ -207,8 +207,8 @@ class Ros2Sink(Sink):
             message = {"header": header(frame, unix_ns), "point": {"x": x, "y": y, "z": 0.0}}
             self._publish_to(sensor, "centroid", POINT_STAMPED, lambda: POINT_STAMPED.encode(message))
         self._publish_to(sensor, "points", POINT_CLOUD, lambda: points(result, self._geometry, frame, unix_ns))
-        found = partial(patches, result, self._contract)  # as long as the pattern takes: only for a subscriber
-        self._publish_to(sensor, "contacts", POINT_CLOUD, lambda: contacts(found(), frame, unix_ns))
+        find_patches = partial(patches, result, self._contract)  # as long as the pattern takes: only for a subscriber
+        self._publish_to(sensor, "contacts", POINT_CLOUD, lambda: contacts(find_patches(), frame, unix_ns))
 
     def _clear(self, sensor: _Sensor, unix_ns: int, pattern_value: float) -> None:
         """Publish once, where there were maps, that they no longer hold: zeros, or NaN where nothing is known.
