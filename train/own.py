@@ -156,6 +156,7 @@ class Comparison(NamedTuple):
 
     table: str
     objection: str | None  # why it is not handed over
+    gains: Mapping[str, str]  # over the bundled model, with intervals, by set
 
 
 def compared(
@@ -179,7 +180,7 @@ def compared(
     bilinear = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"]
     cells: dict[str, list[str]] = {name: [] for name in (*models, "bilinear")}
     times_us: dict[str, list[float]] = {name: [] for name in models}
-    gains: list[str] = []
+    gains: dict[str, str] = {}
     objections: list[str] = []
     for what, presses in sets.items():
         as_read = FrozenPresses(presses, np.ones(0, dtype=np.float32))
@@ -199,7 +200,7 @@ def compared(
             low, high = bootstrap_interval(gained, presses.pad)
             gain = f"{gained.mean():+.2f} ({low:+.2f} to {high:+.2f})"
             if name == bundled.name:
-                gains.append(gain)
+                gains[what] = gain
             decides = name in (bundled.name, "bilinear") or what == TAPPED
             if name != OWN and decides and (high < 0 if what == UNLIKE else low <= 0):
                 objections.append(f"on {what} it is {gain} dB to {name}")
@@ -214,10 +215,10 @@ def compared(
             )
     names = [f"{what} [dB]" for what in sets] + ["recordings with holes"] * bool(grips)
     lines = [" | ".join(("method", *names, "run time [us]"))]
-    for name, row in (cells | {f"over {bundled.name}": gains}).items():
+    for name, row in (cells | {f"over {bundled.name}": [*gains.values()]}).items():
         run_us = f"{np.median(times_us[name]):.0f}" if name in times_us else "-"
         lines.append(" | ".join((name, *row, *["-"] * (len(names) - len(row)), run_us)))
-    return Comparison("\n".join(lines), "; ".join(objections) or None)
+    return Comparison("\n".join(lines), "; ".join(objections) or None, gains)
 
 
 def _holes(grip: Grip, model: ModelSession, pad: Pad) -> float:
