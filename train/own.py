@@ -156,6 +156,7 @@ class Comparison(NamedTuple):
 
     table: str
     objection: str | None  # why it is not handed over
+    gains: Mapping[str, str]  # over the bundled model, with intervals, by set
 
 
 def compared(
@@ -179,7 +180,7 @@ def compared(
     bilinear = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"]
     cells: dict[str, list[str]] = {name: [] for name in (*models, "bilinear")}
     times_us: dict[str, list[float]] = {name: [] for name in models}
-    gains: list[str] = []
+    gains: dict[str, str] = {}
     objections: list[str] = []
     for what, presses in sets.items():
         as_read = FrozenPresses(presses, np.ones(0, dtype=np.float32))
@@ -199,7 +200,7 @@ def compared(
             low, high = bootstrap_interval(gained, presses.pad)
             gain = f"{gained.mean():+.2f} ({low:+.2f} to {high:+.2f})"
             if name == bundled.name:
-                gains.append(gain)
+                gains[what] = gain
             decides = name in (bundled.name, "bilinear") or what == TAPPED
             if name != OWN and decides and (high < 0 if what == UNLIKE else low <= 0):
                 objections.append(f"on {what} it is {gain} dB to {name}")
@@ -214,10 +215,10 @@ def compared(
             )
     names = [f"{what} [dB]" for what in sets] + ["recordings with holes"] * bool(grips)
     lines = [" | ".join(("method", *names, "run time [us]"))]
-    for name, row in (cells | {f"over {bundled.name}": gains}).items():
+    for name, row in (cells | {f"over {bundled.name}": [*gains.values()]}).items():
         run_us = f"{np.median(times_us[name]):.0f}" if name in times_us else "-"
         lines.append(" | ".join((name, *row, *["-"] * (len(names) - len(row)), run_us)))
-    return Comparison("\n".join(lines), "; ".join(objections) or None)
+    return Comparison("\n".join(lines), "; ".join(objections) or None, gains)
 
 
 def _holes(grip: Grip, model: ModelSession, pad: Pad) -> float:
@@ -259,26 +260,10 @@ def _train(options: argparse.Namespace) -> None:
     families = dict(SHARES) | {mesh_name(path, options.unit_mm): 20.0 for path in options.mesh}
     world = World(families=families, ranges=knowledge.ranges, seed=options.seed)
     plan = plan_of(options.minutes, world, work)
-    even = replace(world, families=dict.fromkeys(families, 1.0), count=COMPARED, per_pad=6, begun=0.0)
-    sets = {
-        "validation": even,
-        "test": even,
-        "all families": even,
-        "figures": replace(even, families=dict.fromkeys(FIGURES, 1.0)),
-        UNLIKE: replace(even, ranges=knowledge.widened()),
-    }
-    made = {}
-    with quiet_workers():
-        presses = make_presses(replace(world, count=plan.presses), work / "presses.npz")
-        for number, (what, of) in enumerate(sets.items(), 1):
-            path = work / f"{what.replace(' ', '-')}.npz"
-            made[what] = make_presses(replace(of, seed=options.seed + 1000 * number), path)
-    name, sensor = out.resolve().name, knowledge.sensor()
-    frozen = freeze_presses(made["validation"], SEED, sensor.nuisances).as_frozen_set()
-    report = fit_network(_training(name, sensor, plan.steps), presses, frozen, work, taps.get("training"))
-    say(f"{report['steps']} steps in {report['elapsed_s'] / 60:.1f} minutes")
-    path = _exported(work, name)
-    judges = {what: made[what] for what in list(sets)[2:]} | ({TAPPED: taps["test"]} if taps else {})
+    name = out.resolve().name
+    path, judges = trained(knowledge, world, plan, COMPARED, work / f"{name}.pt", taps.get("training"))
+    if taps:
+        judges[TAPPED] = taps["test"]
     verdict = compared(ModelSession(path), knowledge, judges, grips, beside)
     say(verdict.table)
     objection = verdict.objection
@@ -296,6 +281,35 @@ def _train(options: argparse.Namespace) -> None:
 
 
 COMPARED: Final = 480  # presses of each set that nothing is trained on
+
+
+def trained(
+    knowledge: Knowledge, world: World, plan: Plan, compared_on: int, checkpoint: Path, taps: PressSet | None = None
+) -> tuple[Path, dict[str, PressSet]]:
+    """Make presses of a world, train on them, and export the model; return it and the sets that it is to be judged on.
+
+    A set has `compared_on` presses. All is kept next to the checkpoint, so that an interrupted call resumes.
+    """
+    work, name = checkpoint.parent, checkpoint.stem
+    even = replace(world, families=dict.fromkeys(world.families, 1.0), count=compared_on, per_pad=6, begun=0.0)
+    sets = {
+        "validation": even,
+        "test": even,
+        "all families": even,
+        "figures": replace(even, families=dict.fromkeys(FIGURES, 1.0)),
+        UNLIKE: replace(even, ranges=knowledge.widened()),
+    }
+    made = {}
+    with quiet_workers():
+        presses = make_presses(replace(world, count=plan.presses), work / "presses.npz")
+        for number, (what, of) in enumerate(sets.items(), 1):
+            path = work / f"{what.replace(' ', '-')}.npz"
+            made[what] = make_presses(replace(of, seed=world.seed + 1000 * number), path)
+    sensor = knowledge.sensor()
+    frozen = freeze_presses(made["validation"], SEED, sensor.nuisances).as_frozen_set()
+    report = fit_network(_training(name, sensor, plan.steps), presses, frozen, work, taps)
+    say(f"{report['steps']} steps in {report['elapsed_s'] / 60:.1f} minutes")
+    return _exported(work, name), {what: made[what] for what in list(sets)[2:]}
 
 
 def _exported(work: Path, name: str) -> Path:

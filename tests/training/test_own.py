@@ -88,15 +88,15 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     sets = {name: solve_pad(World(count=12, per_pad=12, seed=seed), 0) for seed, name in enumerate(("figures", UNLIKE))}
     found = knowledge_of(FILE, "4")
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
-    table, objection = compared(tiny, found, sets, [])
+    table, objection, gains = compared(tiny, found, sets, [])
     rows = [line.split(" | ")[0] for line in table.splitlines()]
-    assert rows == ["method", OWN, "stsr-int8", "bilinear", "over stsr-int8"]
+    assert rows == ["method", OWN, "stsr-int8", "bilinear", "over stsr-int8"] and gains["figures"] in table
     assert objection is not None and "on figures it is -" in objection and "to stsr-int8" in objection
     rest = Baseline.from_counts("xela_4", np.full((2, 3, 4, 4), 30_000), created_unix_s=0.0)
     free = Grip("untouched", np.full((30, 3, 4, 4), 30_000), rest)
-    _, objection = compared(tiny, found, sets, [free])
+    _, objection, _ = compared(tiny, found, sets, [free])
     assert "in untouched nan% of its patterns have holes" in objection, "no pattern is no proof"
-    _, objection = compared(ModelSession(find_model("stsr-int8")), found, sets, [])
+    _, objection, _ = compared(ModelSession(find_model("stsr-int8")), found, sets, [])
     assert objection is not None and UNLIKE not in objection, "no worse there"
 
 

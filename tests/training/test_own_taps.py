@@ -227,9 +227,9 @@ def test_what_loses_on_own_taps_is_not_handed_over(tapped, tmp_path):
     assert set(parts) == {"training", "validation", "test"} and len(np.unique(parts["test"].pad)) == 3
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
     bundled = ModelSession(find_model("stsr-int8"))
-    table, objection = compared(tiny, found, {TAPPED: parts["test"]}, [], [bundled])
+    table, objection, _ = compared(tiny, found, {TAPPED: parts["test"]}, [], [bundled])
     assert OWN in table and objection is not None and f"on {TAPPED} it is -" in objection
-    _, objection = compared(bundled, found, {TAPPED: parts["test"]}, [], [tiny])
+    _, objection, _ = compared(bundled, found, {TAPPED: parts["test"]}, [], [tiny])
     assert objection is not None and "to tiny" not in objection, "better than tiny, and no better than itself"
 
 

@@ -12,6 +12,7 @@ from typing import Final
 from edge.inference.bundled import BUNDLE_DIR
 from edge.terminal.progress_bar import tracked
 from train.errors import ended_by_errors
+from train.experiments.blind_sensors import blind_sensors
 from train.experiments.families import families, pads
 from train.experiments.fig5 import fig5
 from train.experiments.fig7 import fig7
@@ -27,8 +28,8 @@ from train.report import Report
 EXPERIMENTS: Final[dict[str, Experiment]] = {
     work.__name__.replace("_", "-"): work
     for work in (
-        *(families, pads, trust_checks, posed_taps, nonnegative, real, second_world, table3, table4, angle, taps),
-        *(unseen, fig5, fig7),
+        *(families, pads, trust_checks, posed_taps, nonnegative, real, second_world, blind_sensors, table3, table4),
+        *(angle, taps, unseen, fig5, fig7),
     )
 }
 """Functions of the experiments by name; the first line of each one's docstring is its help."""

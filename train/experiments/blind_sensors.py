@@ -1,0 +1,130 @@
+"""What a model for one sensor gains on an ordinary sensor, whose gains and constants were found from its contacts.
+
+Sensors are drawn from the whole range of pads. Their sensor files hold what contacts of mixed families and one weight
+determine; then train.own makes a model for each, and it is evaluated on presses of that very sensor, too.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.doctor.guided_press import COVERED_ERROR, Weighed
+from edge.evaluation.classical_methods import fit_gain
+from edge.evaluation.metrics import psnr_db
+from edge.inference.onnx_session import ModelSession
+from edge.perception.gain_learning import load_contact_model
+from edge.terminal.progress_bar import tracked
+from firmware_bridge.pad_geometry import AXES, USPA44
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES, Pad
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, with_scale
+from train.data.presses import PressSet
+from train.data.world import World
+from train.experiments.workbench import Workbench, infer, name_of
+from train.families.family_shares import FIGURES, SHARES
+from train.learning.contact_mixture import learned, place_effects
+from train.own import COMPARED, Knowledge, Plan, compared, knowledge_of, trained
+from train.physics.gripped import MAX_INDENTATION_MM
+from train.physics.pad_draws import draw_pad
+from train.physics.sensor_noise import NAMES, Nuisances, apply_nuisances
+from train.report import Report, Row, with_interval
+
+_SENSORS: Final = 10
+_CONTACTS: Final = 200
+_JUDGED: Final = 240  # presses of a sensor, of each kind, on which models are evaluated
+_SEED: Final = 8_300_001
+_OF_ONE: Final = ("hysteresis", "cross_talk")  # nuisances that are the same in all presses of one sensor
+_FOUND, _OWN, _FACTOR = "bundled, sensor file as found", "own model, sensor file as found", "with the best factor"
+Figures = dict[str, NDArray[np.float64]]  # PSNR of presses, (n,) in dB, by what makes the patterns
+
+
+class BlindSensor(NamedTuple):
+    """A simulated sensor, and what was found of it."""
+
+    number: int
+    chips: NDArray[np.float32]  # their gains, (3, rows, cols)
+    truth: Pad  # its constants and gains
+    found: Knowledge
+
+    def figures(self, own: ModelSession, bundled: ModelSession, presses: PressSet) -> Figures:
+        """Return how well models do on presses on its pad, told what was found or more."""
+        pad, truth = self.found.pad, presses.patterns.astype(np.float32)
+        windows = _read(presses, self.chips, self.number, _SEED + 1)[:, None]
+        runs = {
+            "bundled, nothing known": (bundled, Pad()),
+            _FOUND: (bundled, pad),
+            _OWN: (own, pad),
+            f"{_FOUND}, true modulus": (bundled, replace(pad, shear_modulus_mpa=self.truth.shear_modulus_mpa)),
+            "bundled, true constants and gains": (bundled, self.truth),
+        }
+        maps = {name: infer(model, windows, [known] * len(windows)).patterns for name, (model, known) in runs.items()}
+        maps |= {f"{name}, {_FACTOR}": fit_gain(maps[name], truth) * maps[name] for name in (_FOUND, _OWN)}
+        return {name: psnr_db(made, truth, MAX_INDENTATION_MM) for name, made in maps.items()}
+
+
+def blind_sensors(bench: Workbench, report: Report) -> None:
+    """Train a model for each of ten sensors that were found from contacts and a weight, and judge it on that sensor."""
+    plan, compared_on = (Plan(48, 1), 24) if bench.quick else (Plan(4000, 1500), COMPARED)
+    world = World(seed=_SEED, count=_SENSORS * _JUDGED, per_pad=_JUDGED, families=dict.fromkeys(SHARES, 1.0))
+    figures = replace(world, families=dict.fromkeys(FIGURES, 1.0))
+    sets = {"all": bench.presses("blind-all", world), "figures": bench.presses("blind-figures", figures)}
+    bundled, rows, found = bench.model(), list[Row](), {kind: list[Figures]() for kind in sets}
+    for sensor in tracked(list(_sensors(bench)), "sensors", "sensor"):
+        like, work = World(ranges=sensor.found.ranges), bench.checkpoints / f"blind-{sensor.number}"
+        path, alike = trained(sensor.found, like, plan, compared_on, work / "own.pt")
+        own = ModelSession(path)
+        row: Row = {"sensor": sensor.number}
+        for kind, of in sets.items():
+            found[kind].append(sensor.figures(own, bundled, of.pick(of.pad == np.unique(of.pad)[sensor.number])))
+            over = found[kind][-1][_OWN] - found[kind][-1][_FOUND]
+            row[f"its own, {kind}"] = with_interval(over, np.arange(len(over)), sign="+")
+        verdict = compared(own, sensor.found, alike, [])
+        rows.append({**row, **verdict.gains, "handed over": "no" if verdict.objection else "yes"})
+    report.say(
+        f"{name_of(bundled)} and a model of `train.own` for each of {len(rows)} sensors ({plan.presses} presses, "
+        f"{plan.steps} steps), in 8-bit integers. Sensors are of the whole range of pads (seed {_SEED}), with gains, "
+        f"cross-talk and lag of their own. Both models get the sensor file: what {_CONTACTS} contacts determine, and "
+        f"counts per newton by a weight, within {COVERED_ERROR:.0%}. {_JUDGED} presses of each kind and sensor; PSNR "
+        "in dB; 95 % intervals by sensor, then by press and pad. The best factor is one for each sensor, by the truth."
+    )
+    report.table(_means(found), "By what makes the patterns; over the bundled model with the same sensor file.")
+    report.table(rows, "Own model over the bundled one, on the sensor's presses, and on pads as `train.own` compares.")
+
+
+def _means(found: Mapping[str, list[Figures]]) -> list[Row]:
+    rows = [Row(patterns=name) for name in found["all"][0]]
+    for kind, figures in found.items():
+        of = np.repeat(np.arange(len(figures)), [len(one[_FOUND]) for one in figures])
+        for row in rows:
+            values, base = (np.concatenate([one[name] for one in figures]) for name in (str(row["patterns"]), _FOUND))
+            row |= {f"{kind}, PSNR dB": with_interval(values, of), f"{kind}, over": with_interval(values - base, of)}
+    return rows
+
+
+def _sensors(bench: Workbench) -> Iterator[BlindSensor]:
+    """Yield sensors whose gains and constants were found from contacts, and their counts per newton by a weight."""
+    world = World(seed=_SEED, count=_SENSORS * _CONTACTS, per_pad=_CONTACTS)
+    presses, model = bench.presses("blind-contacts", world), load_contact_model()
+    for number, drawn in enumerate(np.unique(presses.pad)):
+        pad, rng = draw_pad(np.random.default_rng([_SEED, number])), np.random.default_rng([_SEED, 1, number])
+        chips = 1 + np.float32(GAIN_SPREAD) * rng.standard_normal(USPA44.scan_shape, dtype=np.float32).clip(-2, 2)
+        contacts = _read(presses.pick(presses.pad == drawn), chips, number, _SEED)
+        # Seats and moments of the magnets are gains, too; the mean of those of z is part of the counts per newton.
+        gains = chips.reshape(len(AXES), -1) * place_effects(pad)[0]
+        scale = float(gains[AXES.index("z")].mean())
+        true = {name: getattr(pad, name) for name in PAD_RANGES} | {"counts_per_newton": pad.counts_per_newton * scale}
+        true_gains = tuple((gains / scale).ravel().tolist())
+        weighed = Weighed(true["counts_per_newton"] * rng.normal(1, COVERED_ERROR / LEVEL_90), COVERED_ERROR)
+        found = with_scale(learned(contacts, model).pad(), weighed.counts_per_newton, weighed.interval)
+        known = knowledge_of(SensorFile(sensors={str(number): SensorEntry(pad=found)}), None)
+        truth = Pad(**true, intervals={}, gains=true_gains, gain_half_widths=(0.0,) * GAINS)
+        yield BlindSensor(number, chips, truth, known)
+
+
+def _read(presses: PressSet, chips: NDArray[np.float32], number: int, seed: int) -> NDArray[np.float32]:
+    """Return what a sensor reads in presses, (n, 3, rows, cols): each with drift and noise of its own."""
+    lags = Nuisances().without(*(name for name in NAMES if name not in _OF_ONE))
+    felt = apply_nuisances(presses.counts[:, 0][None, :, None], lags, [_SEED, number])[0, :, 0] * chips
+    return apply_nuisances(felt[:, None, None], Nuisances().without(*_OF_ONE, "gain_spread"), [seed, number])[:, 0, 0]
