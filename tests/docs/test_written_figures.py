@@ -64,13 +64,13 @@ def test_keys_of_a_record(tmp_path):
     assert load_recording(tmp_path / "records.npz").tracks
 
 
-def test_all_that_the_pages_say_of_a_record_can_be_chosen_and_nothing_else():
+def test_fields_take_what_the_pages_say_of_a_record_alone():
     for name in told("Records") | {"contacts"}:
         assert cli.parsed_options("demo", ["--sink", "jsonl:-", "--fields", name]).fields == name
     assert set(CHOICES) == told("Records") | {"contacts"}
 
 
-def test_each_counter_is_explained_and_those_that_grow_while_all_is_well_come_first():
+def test_each_counter_is_explained_those_of_good_runs_first():
     page = (ROOT / "docs" / "run.md").read_text()
     links = ("slcan:/dev/ttyUSB0", "gs_usb", "can:socketcan:can0", "xela-server:ws://127.0.0.1")
     counters = {name for link in links for name in open_source(link).counters()} | Statistics().counters().keys()

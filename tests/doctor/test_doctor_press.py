@@ -179,7 +179,7 @@ class TestPerson:
         ],
     )
     @pytest.mark.parametrize("noise", [1.0, 2.0, 6.0, 12.0])
-    def test_a_weight_is_steady_where_it_moves_no_more_than_the_pad_s_own_noise(self, course, steady, noise):
+    def test_a_weight_is_steady_within_the_noise_of_its_pad(self, course, steady, noise):
         time_s = np.arange(400) / 100
         share = {"lies": time_s**0, "is laid down": time_s / 5, "tilts": 1 + 0.1 * np.sin(2 * np.pi * time_s)}[course]
         for seed in range(20):

@@ -86,7 +86,7 @@ def test_arrays_hold_scans_results_maps_baselines_and_poses(made):
     assert arrays["pose"][1].tolist() == [4.0, -4 / 3, 40.0, 0.4, 0.5]
 
 
-def test_each_key_of_a_record_is_an_array_or_is_named_as_left_out(made, capsys):
+def test_each_key_of_a_record_is_an_array_or_named_as_left_out(made, capsys):
     path, results = made
     arrays = arrays_of(path)
     left_out = set(re.findall(r"\w+", capsys.readouterr().out.partition("not in it: ")[2]))

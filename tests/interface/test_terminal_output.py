@@ -142,7 +142,7 @@ ODD = ["a  b", "it's", "a;b$c`d", "tab\there\nthere", "\x1b[31mred", "back\\slas
         (["--source", "NAME.csv"], "did you mean ", ["replay:NAME.csv"]),
     ],
 )
-def test_a_command_of_advice_can_be_typed_whatever_a_file_is_called(name, command, advice, meant, capsys):
+def test_commands_of_advice_can_be_typed_whatever_the_file(name, command, advice, meant, capsys):
     """As bash takes it: its arguments that hold the name are those of the files."""
     assert cli.main([word.replace("NAME", name) for word in command]) == 2
     (line,) = capsys.readouterr().err.splitlines()

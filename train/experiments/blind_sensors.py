@@ -1,4 +1,4 @@
-"""What a model for one sensor gains on an ordinary sensor, whose gains and constants were found from its contacts.
+"""Gain of a model for one sensor on an ordinary one, whose gains and constants were learned from its contacts.
 
 Sensors are drawn from the whole range of pads. Their sensor files hold what contacts of mixed families and one weight
 determine; then train.own makes a model for each, and it is evaluated on presses of that very sensor, too.
