@@ -90,23 +90,18 @@ def recorded_map(schema: str, data: bytes | memoryview) -> NDArray[np.float32]:
     Raises a CdrError where it is none of these, a ValueError where it is of other numbers.
     """
     if schema == GRID.name:
-        grid = GRID.decode(data)
-        count, kinds = len(grid["fields"]), {field["type"] for field in grid["fields"]}
+        message = GRID.decode(data)
+        count, kinds = len(message["fields"]), {field["type"] for field in message["fields"]}
         if kinds != {_FLOAT32}:
             raise ValueError(f"a grid of numbers of type {sorted(kinds)}, expected {_FLOAT32}, float32")
-        columns, strides = grid["column_count"], (grid["row_stride"], grid["cell_stride"])
-        offsets = [field["offset"] for field in grid["fields"]]
+        columns, strides = message["column_count"], (message["row_stride"], message["cell_stride"])
+        offsets = [field["offset"] for field in message["fields"]]
         wanted = (4 * count * columns, 4 * count)
-        if (
-            columns == 0
-            or strides != wanted
-            or offsets != list(range(0, 4 * count, 4))
-            or len(grid["data"]) % wanted[0]
-        ):
+        if not columns or strides != wanted or offsets != [*range(0, 4 * count, 4)] or len(message["data"]) % wanted[0]:
             raise ValueError(
                 f"a grid of {columns} columns, strides {strides}, fields at {offsets}: expected whole rows"
             )
-        layers = grid["data"].view("<f4").reshape(-1, columns, count).transpose(2, 0, 1)
+        layers = message["data"].view("<f4").reshape(-1, columns, count).transpose(2, 0, 1)
         return layers[0] if count == 1 else layers
     message = IMAGE.decode(data)
     if message["encoding"] not in ("32FC1", "32FC3") or message["is_bigendian"]:
