@@ -42,7 +42,6 @@ from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.serial_ports import serial_ports
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
@@ -125,7 +124,7 @@ class Visit:
             remedy = "forces in newtons are a quarter off either way until a weight is laid on: run the doctor again"
             findings.append(Finding("force", "not known", "no weight was laid on", "", remedy))
         examined.findings.extend(replace(finding, sensor=name) for finding in findings)
-        if guide.weighed is not None and guide.weighed.interval[1] <= PAD_RANGES["counts_per_newton"][1]:
+        if guide.weighed is not None and guide.weighed.plausible:
             self.weighed[name] = guide.weighed
         if found is not None:
             self.mountings[name] = found

@@ -152,6 +152,14 @@ class Weighed(NamedTuple):
         """The interval itself."""
         return self.counts_per_newton * (1 - self.error), self.counts_per_newton * (1 + self.error)
 
+    @property
+    def plausible(self) -> bool:
+        """Whether the interval holds a value that sensors have; else the weight has other grams than were typed."""
+        low, high = self.interval
+        return low <= PLAUSIBLE[1] and high >= PLAUSIBLE[0]
+
+
+PLAUSIBLE: Final = (900.0, 1700.0)  # counts per newton, around the 1150 to 1370 of data sheets and of a fit
 
 ASK_WEIGHT: Final = (
     "For forces in newtons, weigh something flat that covers the whole pad. Type its grams and Enter; Enter alone "
@@ -169,12 +177,17 @@ those of 14 and 16 mm, which do not, 0.68 to 1.15."""
 
 def judge_force(weighed: Weighed | None, *, kept: bool) -> Finding:
     """Return the finding on a weight that was laid on; None stands for nothing steady."""
-    low, high = 900.0, 1700.0  # around the 1150 to 1370 of data sheets and of a fit
+    low, high = PLAUSIBLE
     norm = f"{low:.0f} to {high:.0f}"
     if weighed is None:
         return Finding("force", "not known", "no steady weight measured", norm, "lay it on the whole pad, hands off")
     counts_per_newton, error = weighed
     measured = f"{counts_per_newton:.0f} counts per newton, within {100 * error:.0f} %"
+    if not weighed.plausible:
+        remedy = (
+            "no sensor reads so, and it is not kept: does the weight have the grams typed, and rest on the pad alone?"
+        )
+        return Finding("force", "look", measured, norm, remedy)
     if error > COVERED_ERROR:
         remedy = "it bears on a part of the pad: lay it on something flat that covers all of it, and weigh both"
         return Finding("force", "look", measured, norm, remedy)

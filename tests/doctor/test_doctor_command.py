@@ -140,6 +140,15 @@ def test_the_next_run_goes_by_the_order_axes_and_force_measured(monkeypatch, tmp
     assert settled["taxel order"] == settled["axis signs"] == settled["load"] == "ok"
 
 
+def test_a_scale_of_mistyped_grams_is_not_kept(tmp_path):
+    person, file = Person(), tmp_path / "sensor.toml"
+    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+        done = doctor(emulator.port, "--rate-hz", 400, "--out", file, people=[person], typed=["2000"], drift_s=0.4)
+    (entry,) = load_sensor_file(file).sensors.values()
+    assert "not kept" in " ".join(done.out.split()) and "train.own" not in done.out
+    assert entry.counts_per_newton is entry.counts_per_newton_interval is None
+
+
 def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path):
     file, out, err = tmp_path / "practice.toml", io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):

@@ -144,16 +144,20 @@ class TestPerson:
         assert mounting is None and {one.verdict for one in findings.values()} == {"not known"}
 
     @pytest.mark.parametrize(
-        ("z_counts", "beside", "error", "verdict"),
+        ("z_counts", "beside", "error", "verdict", "kept"),
         [
-            (2353.6, 1.0, 0.08, "ok"),
-            (2353.6, 0.3, 0.08, "ok"),
-            (2353.6, 0.2, 0.3, "look"),
-            (2353.6, -0.4, 0.3, "look"),  # the layer bulges beside the weight
-            (200.0, 1.0, 0.08, "look"),
+            (2353.6, 1.0, 0.08, "ok", True),
+            (2353.6, 0.3, 0.08, "ok", True),
+            (2353.6, 0.2, 0.3, "look", True),
+            (2353.6, -0.4, 0.3, "look", True),  # the layer bulges beside the weight
+            (1700.0, 1.0, 0.08, "look", True),
+            (1500.0, 1.0, 0.08, "look", False),
+            (1500.0, 0.2, 0.3, "look", True),
+            (3800.0, 1.0, 0.08, "look", False),
+            (200.0, 1.0, 0.08, "look", False),  # 2000 g typed as 200
         ],
     )
-    def test_a_weight_gives_counts_per_newton(self, z_counts, beside, error, verdict):
+    def test_a_weight_gives_counts_per_newton(self, z_counts, beside, error, verdict, kept):
         laid, share = np.zeros((120, 3, 4, 4)), np.full((4, 4), beside / 16)
         share[1:3, 1:3] = (16 - 12 * beside) / 64
         laid[:, 2] = z_counts * share + np.random.default_rng(0).normal(0, 1, (120, 4, 4))
@@ -162,7 +166,8 @@ class TestPerson:
         asked, guide = answer_to(script, typed=["200"])
         assert asked[-2:] == ["Lay 200 g on the pad, flat and covering all of it, hands off.", "Good. Take it off."]
         assert guide.weighed == pytest.approx((z_counts / 1.96133, error), rel=0.02)
-        assert judge_force(guide.weighed, kept=False).verdict == verdict
+        finding = judge_force(guide.weighed, kept=False)
+        assert finding.verdict == verdict and guide.weighed.plausible == kept == ("not kept" not in finding.remedy)
 
     def test_an_unsteady_weight_gives_none(self):
         laid = np.zeros((7000, 3, 4, 4))
