@@ -1,31 +1,42 @@
 """Identify a sensor from its own recordings: the gains of its channels, and constants of its pad.
 
     python -m train.identify recordings --out sensor.toml
+    python -m train.identify ball.csv --ball-mm 40 --out sensor.toml
 
 RECORDINGS is a folder of TRIAL/xela_SENSOR.csv; one trial has to end with a free pad, from which all are zeroed.
 Constants that contacts determine are written into the sensor file's [pad] section with their 90 % intervals; constants
-that remain as open as the range of simulated pads are left out.
+that remain as open as the range of simulated pads are left out. With --ball-mm it is one recording in which a ball of
+that diameter was pressed onto the pad several times, which tells of all constants, best after a weight was laid on it.
 """
 
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.bundled import CONTACTS
 from edge.perception.gain_learning import load_contact_model
+from edge.terminal.argument_types import positive
 from firmware_bridge.pad_geometry import AXES, USPA44
-from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
-from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file, with_scale
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 from train.data.real_grips import recorded_sets, recording_paths
+from train.data.recorded_taps import recorded_presses
 from train.errors import DatasetError, ended_by_errors
-from train.learning.contact_mixture import CONSTANTS, learned, normalise
+from train.learning.ball_fit import fit_ball
+from train.learning.contact_mixture import learned, normalise
 from train.physics.pad_draws import RANGES
+
+LEAST_PRESSES: Final = 8
+MOST_PRESSES: Final = 24  # each takes a second or two to fit
 
 
 def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
@@ -54,6 +65,42 @@ def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
     return counts[kept]
 
 
+def contact_pads(folder: Path) -> dict[str, tuple[str, Pad]]:
+    """Return of each sensor of a folder how many distinct contacts it has, and its pad by them."""
+    model, told = load_contact_model(CONTACTS), {}
+    for sensor, counts in recorded_contacts(folder).items():
+        learner = learned(counts, model)
+        told[sensor.removeprefix("xela_")] = f"{learner.contacts} distinct contacts", learner.pad()
+    return told
+
+
+def ball_pads(path: Path, diameter_mm: float, file: SensorFile) -> dict[str, tuple[str, Pad]]:
+    """Return of each sensor of a recording how many presses of a ball are fitted, and its pad by them.
+
+    RecordingError, BaselineRefusedError or DatasetError if there are too few, or they are not of that ball.
+    """
+    recording, pads = load_recording(path), {}
+    for name in (track.sensor for track in recording.tracks):
+        entry = file.sensors.get(name, SensorEntry())
+        if recording.origin == "emulated" and file.path is not None and not entry.emulated:
+            raise DatasetError(f"{path} is of an emulated sensor, and sensor {name} in {file.path} of a device")
+        counts = recorded_presses(path, entry, name)
+        if len(counts) < LEAST_PRESSES:
+            raise DatasetError(
+                f"{path}: {len(counts)} presses on sensor {name}, expected {LEAST_PRESSES} or more of a ball alone, "
+                "from light to firm and all over the pad, which is free in between"
+            )
+        counts = counts[:: -(-len(counts) // MOST_PRESSES)]
+        known = with_scale(entry.used_pad, entry.counts_per_newton, entry.counts_per_newton_interval) or Pad()
+        by_hand = entry.pad or Pad()
+        fitted = fit_ball(counts, diameter_mm, known)
+        pads[name] = (
+            f"{len(counts)} presses of a ball",
+            replace(fitted, gains=by_hand.gains, gain_half_widths=by_hand.gain_half_widths),
+        )
+    return pads
+
+
 def extended(path: Path, pads: Mapping[str, Pad]) -> SensorFile:
     """Return the existing sensor file with these pads, or a new one with these pads alone."""
     before = load_sensor_file(path) if path.exists() else SensorFile()
@@ -64,17 +111,19 @@ def extended(path: Path, pads: Mapping[str, Pad]) -> SensorFile:
     return replace(before, sensors=sensors)
 
 
-def table(sensor: str, contacts: int, pad: Pad) -> str:
+def table(sensor: str, contacts: str, pad: Pad) -> str:
     """Return the pad of a sensor as lines of text."""
     lines = [
-        f"{sensor}: {contacts} distinct contacts",
+        f"{sensor}: {contacts}",
         f"{'constant':18} {'prior':>18} {'estimate':>10}  90 % interval",
     ]
-    for name in (name for name in CONSTANTS if name in PAD_RANGES):
+    for name in RANGES:
         known = f"{'-':>10}  not determined by these contacts"
         if name in pad.constants:
             known = f"{pad.constants[name]:10.4g}  " + "{:.4g} .. {:.4g}".format(*pad.intervals[name])
         lines.append(f"{name:18} {'{:.4g} .. {:.4g}'.format(*RANGES[name]):>18} {known}")
+    if pad.gains is None or pad.gain_half_widths is None:
+        return "\n".join(lines)
     gains, width = (np.asarray(values).reshape(USPA44.scan_shape) for values in (pad.gains, pad.gain_half_widths))
     for axis, plane, half in zip(AXES, gains, width, strict=True):
         lines.append(f"gains of {axis}, each within {100 * half.min():.0f} to {100 * half.max():.0f} % of:")
@@ -85,22 +134,23 @@ def table(sensor: str, contacts: int, pad: Pad) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m train.identify", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("recordings", type=Path, metavar="RECORDINGS", help="a folder of TRIAL/xela_SENSOR.csv")
-    parser.add_argument("--out", type=Path, metavar="SENSOR.toml", help="a sensor file to extend or to write")
+    add = parser.add_argument
+    add("recordings", type=Path, metavar="RECORDINGS", help="a folder of TRIAL/xela_SENSOR.csv, or presses of a ball")
+    add("--ball-mm", type=partial(positive, low=4.0, high=200.0), metavar="D", help="diameter of that ball in mm")
+    add("--out", type=Path, metavar="SENSOR.toml", help="a sensor file to extend or to write")
     options = parser.parse_args(arguments)
     with ended_by_errors("train.identify"):
-        contacts = recorded_contacts(options.recordings)
-        model = load_contact_model(CONTACTS)
-        pads = {}
-        for sensor, counts in contacts.items():
-            learner = learned(counts, model)
-            name = sensor.removeprefix("xela_")
-            pads[name] = learner.pad()
-            sys.stdout.write(table(name, learner.contacts, pads[name]) + "\n")
+        file = SensorFile() if options.out is None or not options.out.exists() else load_sensor_file(options.out)
+        if options.ball_mm is None:
+            told = contact_pads(options.recordings)
+        else:
+            told = ball_pads(options.recordings, options.ball_mm, file)
+        for name, (contacts, pad) in told.items():
+            sys.stdout.write(table(name, contacts, pad) + "\n")
         if options.out is not None:
             with changing(options.out):
-                save_sensor_file(options.out, extended(options.out, pads))
-            sys.stdout.write(f"{options.out}: pads of {', '.join(pads)}\n")
+                save_sensor_file(options.out, extended(options.out, {name: pad for name, (_, pad) in told.items()}))
+            sys.stdout.write(f"{options.out}: pads of {', '.join(told)}\n")
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ from train.errors import DatasetError, TrainError, ended_by_errors
 from train.families.family_shares import FIGURES, SHARES
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
-from train.physics.pad_draws import INPUTS, KNOWN, RANGES
+from train.physics.pad_draws import KNOWN, RANGES
 from train.report import bootstrap_interval
 from train.surfaces.meshes import mesh_name
 
@@ -82,7 +82,7 @@ class Knowledge:
     def told(self) -> str:
         """Return it in a sentence."""
         shares = {
-            name: (self.ranges[name][1] - self.ranges[name][0]) / (RANGES[name][1] - RANGES[name][0]) for name in INPUTS
+            name: (self.ranges[name][1] - self.ranges[name][0]) / (RANGES[name][1] - RANGES[name][0]) for name in RANGES
         }
         known = ", ".join(f"{name} to {share:.0%}" for name, share in shares.items() if share < 1)
         spread = 100 * GAIN_SPREAD * (1 - self.pad.gains_certainty)

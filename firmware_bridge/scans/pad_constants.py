@@ -23,6 +23,8 @@ PAD_RANGES: Final = MappingProxyType(
         "in_plane_share": (0.0, 10.0),
         "magnet_height_mm": (0.01, 100.0),
         "counts_per_newton": (1e-3, 1e6),
+        "pitch_mm": (0.1, 100.0),
+        "free_sides": (0.0, 1.0),
     }
 )
 """Constants of a pad, in this order, and their ranges: wider than for any pad, so that only slips are refused."""
@@ -46,6 +48,8 @@ class Pad:
         in_plane_share: factor on the in-plane movement of the magnets.
         magnet_height_mm: height of the magnets' centres over the chips, in [mm].
         counts_per_newton: summed z per [N].
+        pitch_mm: true distance of the taxels of a uSPa44, in [mm].
+        free_sides: compliance of the pad's sides, 0 where they are held, 1 where nothing holds them.
         intervals: lowest and highest value of a constant by its measurement; nothing is computed from them.
         gains: relative gain of each place on each axis, 1 where it reads as the others: x of all places row by row,
             then y, then z, along the pad's axes. Networks that use gains get readings divided by them.
@@ -61,6 +65,8 @@ class Pad:
     in_plane_share: float | None = None
     magnet_height_mm: float | None = None
     counts_per_newton: float | None = None
+    pitch_mm: float | None = None
+    free_sides: float | None = None
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     gains: tuple[float, ...] | None = None
     gain_half_widths: tuple[float, ...] | None = None

@@ -28,6 +28,7 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import GAP_NS, PoseTrack
 from firmware_bridge.recording.csv_reader import CSV_POSES
 from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.pad_constants import Pad as SensorPad
 from firmware_bridge.sensor_file.model import SensorEntry
 from firmware_bridge.zeroing.baseline import deformation
@@ -61,20 +62,12 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
     """
     if path.suffix == ".npy":
         return _published_taps(path)
-    recording = load_recording(path)
-    tracks = {one.sensor: one for one in recording.tracks}
-    track = recording.tracks[0] if len(tracks) == 1 else tracks.get(sensor)
-    if track is None:
-        raise DatasetError(f"{path} has the sensors {', '.join(tracks)}, none of them {sensor}")
+    recording, track, counts = _zeroed(path, entry, sensor)
     if not recording.poses:
         raise DatasetError(
             f"{path} has no poses: record with --poses, or add columns {', '.join(CSV_POSES)} to the CSV"
         )
-    raw = entry.mounting.place_counts(track.counts) if path.suffix.lower() == ".csv" else track.counts
-    rest = free_stretch(raw).baseline(track.sensor, np.nan)
-    mounting = recording.mountings.get(track.sensor, entry.mounting)
-    counts = np.nan_to_num(np.stack([deformation(scan, rest, mounting) for scan in raw]))
-    times = track.time_ns if track.time_ns is not None and not recording.poses_by_row else np.arange(len(raw))
+    times = track.time_ns if track.time_ns is not None and not recording.poses_by_row else np.arange(len(counts))
     poses = iter([one for one in recording.poses if one.sensor in (None, track.sensor)])
     course, due, taps = PoseTrack(), next(poses, None), []
     for frames, peak in _cut(counts):
@@ -88,6 +81,28 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
     if not taps:
         raise DatasetError(f"{path} has no tap with a pose: is it of a free pad, or do the poses end before?")
     return taps
+
+
+def recorded_presses(path: Path, entry: SensorEntry, sensor: str) -> NDArray[np.float32]:
+    """Return the scans (n, 3, rows, cols) of one sensor at full force of each press, zeroed on the free pad before.
+
+    RecordingError, BaselineRefusedError or DatasetError if the sensor is not there, or the pad is never free.
+    """
+    counts = _zeroed(path, entry, sensor)[2]
+    return np.array([frames[-1] for frames, _ in _cut(counts)], dtype=np.float32).reshape(-1, *counts.shape[1:])
+
+
+def _zeroed(path: Path, entry: SensorEntry, sensor: str) -> tuple[Recording, Track, NDArray[np.float32]]:
+    """Return a recording, its track of a sensor, and that track's scans (n, 3, rows, cols) over its free pad."""
+    recording = load_recording(path)
+    tracks = {one.sensor: one for one in recording.tracks}
+    track = recording.tracks[0] if len(tracks) == 1 else tracks.get(sensor)
+    if track is None:
+        raise DatasetError(f"{path} has the sensors {', '.join(tracks)}, none of them {sensor}")
+    raw = entry.mounting.place_counts(track.counts) if path.suffix.lower() == ".csv" else track.counts
+    rest = free_stretch(raw).baseline(track.sensor, np.nan)
+    mounting = recording.mountings.get(track.sensor, entry.mounting)
+    return recording, track, np.nan_to_num(np.stack([deformation(scan, rest, mounting) for scan in raw]))
 
 
 def load_tap_parts(path: Path, sensor: str, pad: SensorPad) -> dict[str, PressSet]:

@@ -1,7 +1,7 @@
-"""Gain of a model for one sensor on an ordinary one, whose gains and constants were learned from its contacts.
+"""Gain of a model for one sensor on an ordinary one, whose constants were found with a weight, contacts and a ball.
 
-Sensors are drawn from the whole range of pads. Their sensor files hold what contacts of mixed families and one weight
-determine; then train.own makes a model for each, and it is evaluated on presses of that very sensor, too.
+Sensors are drawn from the whole range of pads. Their sensor files hold what contacts of mixed families, one weight and
+presses of a ball determine; then train.own makes a model for each, which is evaluated on that very sensor, too.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,21 +18,26 @@ from edge.inference.onnx_session import ModelSession
 from edge.perception.gain_learning import load_contact_model
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import AXES, USPA44
-from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES, Pad
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES
+from firmware_bridge.scans.pad_constants import Pad as SensorPad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, with_scale
 from train.data.presses import PressSet
 from train.data.world import World
 from train.experiments.workbench import Workbench, infer, name_of
-from train.families.family_shares import FIGURES, SHARES
+from train.families.family_shares import BARE, FIGURES, SHARES
+from train.learning.ball_fit import fit_ball
 from train.learning.contact_mixture import learned, place_effects
 from train.own import COMPARED, Knowledge, Plan, compared, knowledge_of, trained
-from train.physics.gripped import MAX_INDENTATION_MM
-from train.physics.pad_draws import draw_pad
-from train.physics.sensor_noise import NAMES, Nuisances, apply_nuisances
+from train.physics.gripped import MAX_INDENTATION_MM, GrippedPad
+from train.physics.pad_draws import Pad, draw_pad
+from train.physics.sensor_noise import NAMES, Nuisances, apply_nuisances, log_uniform
 from train.report import Report, Row, with_interval
 
 _SENSORS: Final = 10
 _CONTACTS: Final = 200
+_BALL_MM: Final = 40.0
+_BALL_PRESSES: Final = 16
+_LEFT_COUNTS: Final = 5.0  # of drift, where the pad was free just before a press
 _JUDGED: Final = 240  # presses of a sensor, of each kind, on which models are evaluated
 _SEED: Final = 8_300_001
 _OF_ONE: Final = ("hysteresis", "cross_talk")  # nuisances that are the same in all presses of one sensor
@@ -45,15 +50,17 @@ class BlindSensor(NamedTuple):
 
     number: int
     chips: NDArray[np.float32]  # their gains, (3, rows, cols)
-    truth: Pad  # its constants and gains
+    truth: SensorPad  # its constants and gains
     found: Knowledge
+    without_ball: SensorPad
 
     def figures(self, own: ModelSession, bundled: ModelSession, presses: PressSet) -> Figures:
         """Return how well models do on presses on its pad, told what was found or more."""
         pad, truth = self.found.pad, presses.patterns.astype(np.float32)
-        windows = _read(presses, self.chips, self.number, _SEED + 1)[:, None]
+        windows = _felt(presses.counts[:, 0], self.chips, self.number, Nuisances(), _SEED + 1)[:, None]
         runs = {
-            "bundled, nothing known": (bundled, Pad()),
+            "bundled, nothing known": (bundled, SensorPad()),
+            "bundled, without the ball": (bundled, self.without_ball),
             _FOUND: (bundled, pad),
             _OWN: (own, pad),
             f"{_FOUND}, true modulus": (bundled, replace(pad, shear_modulus_mpa=self.truth.shear_modulus_mpa)),
@@ -65,7 +72,7 @@ class BlindSensor(NamedTuple):
 
 
 def blind_sensors(bench: Workbench, report: Report) -> None:
-    """Train a model for each of ten sensors that were found from contacts and a weight, and judge it on that sensor."""
+    """Train a model for each of ten sensors that were found with a weight, contacts and a ball, and judge it there."""
     plan, compared_on = (Plan(48, 1), 24) if bench.quick else (Plan(4000, 1500), COMPARED)
     world = World(seed=_SEED, count=_SENSORS * _JUDGED, per_pad=_JUDGED, families=dict.fromkeys(SHARES, 1.0))
     figures = replace(world, families=dict.fromkeys(FIGURES, 1.0))
@@ -85,8 +92,9 @@ def blind_sensors(bench: Workbench, report: Report) -> None:
     report.say(
         f"{name_of(bundled)} and a model of `train.own` for each of {len(rows)} sensors ({plan.presses} presses, "
         f"{plan.steps} steps), in 8-bit integers. Sensors are of the whole range of pads (seed {_SEED}), with gains, "
-        f"cross-talk and lag of their own. Both models get the sensor file: what {_CONTACTS} contacts determine, and "
-        f"counts per newton by a weight, within {COVERED_ERROR:.0%}. {_JUDGED} presses of each kind and sensor; PSNR "
+        "cross-talk and lag of their own. Both models get the sensor file: counts per newton by a weight, within "
+        f"{COVERED_ERROR:.0%}, what {_CONTACTS} contacts determine, and what {_BALL_PRESSES} presses of a ball of "
+        f"{_BALL_MM:g} mm do. {_JUDGED} presses of each kind and sensor; PSNR "
         "in dB; 95 % intervals by sensor, then by press and pad. The best factor is one for each sensor, by the truth."
     )
     report.table(_means(found), "By what makes the patterns; over the bundled model with the same sensor file.")
@@ -110,21 +118,37 @@ def _sensors(bench: Workbench) -> Iterator[BlindSensor]:
     for number, drawn in enumerate(np.unique(presses.pad)):
         pad, rng = draw_pad(np.random.default_rng([_SEED, number])), np.random.default_rng([_SEED, 1, number])
         chips = 1 + np.float32(GAIN_SPREAD) * rng.standard_normal(USPA44.scan_shape, dtype=np.float32).clip(-2, 2)
-        contacts = _read(presses.pick(presses.pad == drawn), chips, number, _SEED)
+        contacts = _felt(presses.counts[presses.pad == drawn, 0], chips, number, Nuisances())
         # Seats and moments of the magnets are gains, too; the mean of those of z is part of the counts per newton.
         gains = chips.reshape(len(AXES), -1) * place_effects(pad)[0]
         scale = float(gains[AXES.index("z")].mean())
         true = {name: getattr(pad, name) for name in PAD_RANGES} | {"counts_per_newton": pad.counts_per_newton * scale}
         true_gains = tuple((gains / scale).ravel().tolist())
         weighed = Weighed(true["counts_per_newton"] * rng.normal(1, COVERED_ERROR / LEVEL_90), COVERED_ERROR)
-        found = with_scale(learned(contacts, model).pad(), weighed.counts_per_newton, weighed.interval)
-        known = knowledge_of(SensorFile(sensors={str(number): SensorEntry(pad=found)}), None)
-        truth = Pad(**true, intervals={}, gains=true_gains, gain_half_widths=(0.0,) * GAINS)
-        yield BlindSensor(number, chips, truth, known)
+        found = with_scale(learned(contacts, model).pad(), weighed.counts_per_newton, weighed.interval) or SensorPad()
+        by_ball = fit_ball(_ball_presses(pad, chips, rng, number), _BALL_MM, found)
+        by_ball = replace(by_ball, gains=found.gains, gain_half_widths=found.gain_half_widths)
+        known = knowledge_of(SensorFile(sensors={str(number): SensorEntry(pad=by_ball)}), None)
+        truth = SensorPad(**true, intervals={}, gains=true_gains, gain_half_widths=(0.0,) * GAINS)
+        yield BlindSensor(number, chips, truth, known, found)
 
 
-def _read(presses: PressSet, chips: NDArray[np.float32], number: int, seed: int) -> NDArray[np.float32]:
+def _ball_presses(pad: Pad, chips: NDArray[np.float32], rng: np.random.Generator, number: int) -> NDArray[np.float32]:
+    """Return what a sensor reads when a ball is pressed onto it by hand, (n, 3, rows, cols)."""
+    gripped, n, way = GrippedPad(pad), _BALL_PRESSES, rng.uniform(0, 2 * np.pi, _BALL_PRESSES)
+    x, y = gripped.places_mm
+    at = rng.uniform(-4, 4, (2, n, 1, 1))
+    heights = np.sqrt((_BALL_MM / 2) ** 2 - np.square(x - at[0]) - np.square(y - at[1])) - _BALL_MM / 2
+    slide = log_uniform(rng, 0.02, 0.3, (n, 1)) * np.stack([np.cos(way), np.sin(way)], axis=1)
+    depths, twists, friction = rng.uniform(0.1, MAX_INDENTATION_MM, n), rng.normal(0, 0.02, n), rng.uniform(0.2, 1.2, n)
+    done = gripped.press(heights.astype(np.float32), depths, slide, twists, friction, [BARE] * n)
+    return _felt(done.counts, chips, number, Nuisances(thermal_drift_counts=_LEFT_COUNTS, earth_field_counts=0.0))
+
+
+def _felt(
+    counts: NDArray[np.float32], chips: NDArray[np.float32], number: int, nuisances: Nuisances, seed: int = _SEED
+) -> NDArray[np.float32]:
     """Return what a sensor reads in presses, (n, 3, rows, cols): each with drift and noise of its own."""
-    lags = Nuisances().without(*(name for name in NAMES if name not in _OF_ONE))
-    felt = apply_nuisances(presses.counts[:, 0][None, :, None], lags, [_SEED, number])[0, :, 0] * chips
-    return apply_nuisances(felt[:, None, None], Nuisances().without(*_OF_ONE, "gain_spread"), [seed, number])[:, 0, 0]
+    lags = nuisances.without(*(name for name in NAMES if name not in _OF_ONE))
+    felt = apply_nuisances(counts[None, :, None], lags, [_SEED, number])[0, :, 0] * chips
+    return apply_nuisances(felt[:, None, None], nuisances.without(*_OF_ONE, "gain_spread"), [seed, number])[:, 0, 0]
