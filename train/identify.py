@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +33,6 @@ from train.errors import DatasetError, ended_by_errors
 from train.learning.ball_fit import fit_ball
 from train.learning.contact_mixture import learned, normalise
 from train.physics.pad_draws import RANGES
-
-LEAST_PRESSES: Final = 8
-MOST_PRESSES: Final = 24  # each takes a second or two to fit
 
 
 def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
@@ -84,18 +80,17 @@ def ball_pads(path: Path, diameter_mm: float, file: SensorFile) -> dict[str, tup
         entry = file.sensors.get(name, SensorEntry())
         if recording.origin == "emulated" and file.path is not None and not entry.emulated:
             raise DatasetError(f"{path} is of an emulated sensor, and sensor {name} in {file.path} of a device")
-        counts = recorded_presses(path, entry, name)
-        if len(counts) < LEAST_PRESSES:
-            raise DatasetError(
-                f"{path}: {len(counts)} presses on sensor {name}, expected {LEAST_PRESSES} or more of a ball alone, "
-                "from light to firm and all over the pad, which is free in between"
-            )
-        counts = counts[:: -(-len(counts) // MOST_PRESSES)]
+        presses = recorded_presses(path, entry, name)
         known = with_scale(entry.used_pad, entry.counts_per_newton, entry.counts_per_newton_interval) or Pad()
+        if "counts_per_newton" not in known.intervals:
+            raise DatasetError(
+                f"counts per newton of sensor {name} are not in the sensor file, and a ball needs them: "
+                "lay a weight on the pad with edge-sr doctor, and pass its file as --out"
+            )
         by_hand = entry.pad or Pad()
-        fitted = fit_ball(counts, diameter_mm, known)
+        fitted = fit_ball(presses, diameter_mm, known)
         pads[name] = (
-            f"{len(counts)} presses of a ball",
+            f"{len(presses)} presses of a ball",
             replace(fitted, gains=by_hand.gains, gain_half_widths=by_hand.gain_half_widths),
         )
     return pads

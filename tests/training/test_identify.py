@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from bridge_samples import write_npz
 
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
@@ -7,7 +8,11 @@ from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import identify
 from train.data.real_grips import recording_paths, recordings_folder
 from train.errors import DatasetError
+from train.families.family_shares import BARE
 from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z, learned
+from train.physics.gripped import GrippedPad
+from train.physics.pad_draws import RANGES
+from train.physics.pad_draws import Pad as SimulatedPad
 
 FOLDER = recordings_folder()
 
@@ -50,7 +55,7 @@ def test_what_contacts_show_is_learned_or_else_the_prior_stays(mixture):
     assert found.determined.tolist() == [False, False, True, False, False, False, False]
     pad = found.pad()
     assert list(pad.constants) == list(pad.intervals) == ["in_plane_share"]
-    assert "not determined" in identify.table("4", found.contacts, pad)
+    assert "not determined" in identify.table("4", "100 contacts", pad)
 
 
 def test_weak_and_clipped_contacts_are_not_used(mixture):
@@ -93,3 +98,66 @@ def test_real_recordings_give_each_sensor_its_gains(tmp_path, capsys):
     assert set(pads) == {"sensor1", "sensor2"}
     assert all(pad.gains is not None and max(pad.gains) > 1.02 for pad in pads.values())
     assert "sensor1" in capsys.readouterr().out
+
+
+class Ball:
+    """A recording of a ball of 40 mm pressed onto a simulated pad, and the pad."""
+
+    def __init__(self, folder, presses):
+        rng = np.random.default_rng(5)
+        self.pad = SimulatedPad(thickness_mm=4.0, poisson=0.42, in_plane_share=0.3, shear_modulus_mpa=0.13)
+        gripped, at = GrippedPad(self.pad), rng.uniform(-4, 4, (2, presses, 1, 1))
+        away = np.square(gripped.places_mm[0] - at[0]) + np.square(gripped.places_mm[1] - at[1])
+        heights = (np.sqrt(20.0**2 - away) - 20).astype(np.float32)
+        course = np.concatenate([np.linspace(0.1, 1, 8), [1, 1], np.linspace(0.9, 0.1, 5)])
+        depths = np.multiply.outer(np.linspace(0.38, 0.5, presses), course)
+        n, every = depths.size, np.arange(presses).repeat(len(course))
+        none = np.zeros(n)
+        done = gripped.press(heights[every], depths.ravel(), np.zeros((n, 2)), none, none + 0.5, [BARE] * n)
+        free = np.zeros((150, 3, 4, 4))
+        scans = np.concatenate([free] + [np.concatenate([one, free]) for one in np.split(done.counts, presses)])
+        scans = 30000 + scans + rng.normal(0, 1.5, scans.shape)
+        self.path = folder / "ball.npz"
+        write_npz(self.path, scans.round().astype(np.uint16))
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    return Ball(tmp_path_factory.mktemp("ball"), 8)
+
+
+def weighed(ball, path):
+    """Write a sensor file with the counts per newton of a ball's pad, within 8 %, and return its path."""
+    scale = ball.pad.counts_per_newton
+    entry = SensorEntry(counts_per_newton=scale, counts_per_newton_interval=(0.92 * scale, 1.08 * scale))
+    save_sensor_file(path, SensorFile(sensors={"4": entry}))
+    return path
+
+
+def test_presses_of_a_ball_give_the_constants(ball, tmp_path, capsys):
+    out = weighed(ball, tmp_path / "sensor.toml")
+    identify.main([str(ball.path), "--ball-mm", "40", "--out", str(out)])
+    pad = load_sensor_file(out).pads["4"]
+    for name in RANGES:
+        assert pad.intervals[name][0] <= getattr(ball.pad, name) <= pad.intervals[name][1], name
+    for name in ("thickness_mm", "poisson", "in_plane_share"):
+        assert abs(getattr(pad, name) - getattr(ball.pad, name)) < 0.15 * np.ptp(RANGES[name]), name
+    assert "4: 8 presses of a ball" in capsys.readouterr().out
+
+
+@pytest.mark.night
+def test_a_ball_of_half_the_stated_size_is_refused(ball, tmp_path):
+    out = weighed(ball, tmp_path / "sensor.toml")
+    before = out.read_bytes()
+    with pytest.raises(SystemExit, match=r"a ball of 80 mm and the counts per newton contradict each other"):
+        identify.main([str(ball.path), "--ball-mm", "80", "--out", str(out)])
+    assert out.read_bytes() == before
+
+
+def test_a_ball_without_a_weight_or_with_few_presses_is_one_line(tmp_path):
+    few = Ball(tmp_path, 5)
+    with pytest.raises(SystemExit, match=r"counts per newton of sensor 4 are not in the sensor file, .*: lay a weight"):
+        identify.main([str(few.path), "--ball-mm", "40"])
+    out = weighed(few, tmp_path / "sensor.toml")
+    with pytest.raises(SystemExit, match=r"5 presses with 10 scans below .* expected 12 or more"):
+        identify.main([str(few.path), "--ball-mm", "40", "--out", str(out)])

@@ -83,13 +83,12 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
     return taps
 
 
-def recorded_presses(path: Path, entry: SensorEntry, sensor: str) -> NDArray[np.float32]:
-    """Return the scans (n, 3, rows, cols) of one sensor at full force of each press, zeroed on the free pad before.
+def recorded_presses(path: Path, entry: SensorEntry, sensor: str) -> list[NDArray[np.float32]]:
+    """Return the rising scans (frames, 3, rows, cols) of each press on one sensor, over the pad that was free before.
 
     RecordingError, BaselineRefusedError or DatasetError if the sensor is not there, or the pad is never free.
     """
-    counts = _zeroed(path, entry, sensor)[2]
-    return np.array([frames[-1] for frames, _ in _cut(counts)], dtype=np.float32).reshape(-1, *counts.shape[1:])
+    return [frames for frames, _ in _cut(_zeroed(path, entry, sensor)[2])]
 
 
 def _zeroed(path: Path, entry: SensorEntry, sensor: str) -> tuple[Recording, Track, NDArray[np.float32]]:

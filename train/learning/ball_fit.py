@@ -5,6 +5,7 @@ simulated sensor's readings are fitted to those of all presses at once, by least
 cross-talk and gains, and of each press its place, depth, drag, friction and lag, and what is left of drift.
 """
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -34,6 +35,9 @@ _NOISE_COUNTS: Final = 3.0
 _MODEL_ERROR: Final = 0.03  # of the simulated sensor, as a share of a taxel's z
 _WIDENING: Final = 1.5  # of intervals, by simulated sensors
 MOST_MISFIT: Final = 12.0
+_MOST_CONTRADICTION: Final = 7.0  # sum of squares, each over its variance
+LEAST_SCANS: Final = 12
+MOST_SCANS: Final = 24  # each takes a second or two to fit
 _OF_PRESS: Final = len(_MOVES) + 1 + len(AXES)
 _Array = NDArray[np.float64]
 
@@ -41,11 +45,7 @@ _Array = NDArray[np.float64]
 class _Presses:
     """Presses of a ball, as a function of what is unknown of them and of the pad, each over its deviation."""
 
-    def __init__(self, counts: NDArray[np.floating], diameter_mm: float, known: SensorPad) -> None:
-        self.counts = counts.reshape(len(counts), CHANNELS).astype(np.float64)
-        z = np.abs(self.counts[:, -TAXELS:])
-        clipped = np.abs(self.counts) > 0.97 * np.repeat(LARGEST_COUNTS, TAXELS)
-        self.error = np.where(clipped, np.inf, np.hypot(_NOISE_COUNTS, _MODEL_ERROR * np.tile(z, len(AXES))))
+    def __init__(self, presses: Sequence[NDArray[np.floating]], diameter_mm: float, known: SensorPad) -> None:
         radius = np.log(diameter_mm / 2) + _BALL_ERROR * np.array([-LEVEL_90, LEVEL_90])
         ends = np.array([known.intervals.get(name, RANGES[name]) for name in RANGES] + [(0, _CROSS_TALK), radius])
         told = np.array([name in known.intervals for name in RANGES] + [False, True])
@@ -56,21 +56,19 @@ class _Presses:
         self.gains = np.ones(CHANNELS) if known.gains is None else np.array(known.gains)
         widths = known.gain_half_widths
         self.gain_spread = np.full(CHANNELS, _GAIN_SPREAD) if widths is None else np.array(widths) / LEVEL_90
-        self._begin = self._first_guess(z)
-
-    def _first_guess(self, z: _Array) -> _Array:
-        """Return place, log depth, drag and log friction of each press (n, 6), by its centre and force."""
-        places = USPA44.taxel_centres_mm()
-        weights = np.square(z) / np.square(z).sum(axis=1, keepdims=True)
         depths = np.geomspace(0.03, MAX_INDENTATION_MM, 10)
         here = np.zeros((len(depths), len(_MOVES)))
         here[:, 2] = np.log(depths)
         sums = self._readings(self.middle, here)[:, -TAXELS:].sum(axis=1)
-        begin = np.zeros((len(z), len(_MOVES)))
-        begin[:, :2] = weights @ places
-        begin[:, 2] = np.log(np.interp(z.sum(axis=1), sums, depths))
-        begin[:, 5] = np.log(0.6)
-        return begin
+        self.counts = _light(presses, 0.9 * float(sums[-1]))
+        z = np.abs(self.counts[:, -TAXELS:])
+        clipped = np.abs(self.counts) > 0.97 * np.repeat(LARGEST_COUNTS, TAXELS)
+        self.error = np.where(clipped, np.inf, np.hypot(_NOISE_COUNTS, _MODEL_ERROR * np.tile(z, len(AXES))))
+        # The first guess of a press is by its centre and force.
+        self._begin = np.zeros((len(z), len(_MOVES)))
+        self._begin[:, :2] = np.square(z) / np.square(z).sum(axis=1, keepdims=True) @ USPA44.taxel_centres_mm()
+        self._begin[:, 2] = np.log(np.interp(z.sum(axis=1), sums, depths))
+        self._begin[:, 5] = np.log(0.6)
 
     def _readings(self, of_pad: _Array, presses: _Array) -> _Array:
         """Return readings (n, CHANNELS) of a pad without gains of its own."""
@@ -140,40 +138,60 @@ class _Presses:
         return np.concatenate([(slopes / self.error[:, :, None]).reshape(n * CHANNELS, -1), np.eye(len(unknown))])
 
 
-def fit_ball(counts: NDArray[np.floating], diameter_mm: float, known: SensorPad) -> SensorPad:
+def _light(presses: Sequence[NDArray[np.floating]], most_counts: float) -> _Array:
+    """Return two scans of each press, (n, CHANNELS): the strongest below a sum of z, and one of about half of that.
+
+    DatasetError if they are fewer than LEAST_SCANS.
+    """
+    picked = []
+    for scans in presses:
+        sums = scans[:, AXES.index("z")].sum(axis=(1, 2))
+        if len(light := np.flatnonzero(sums <= most_counts)):
+            half = np.abs(sums - sums[light[-1]] / 2).argmin()
+            picked += [scans[at].ravel() for at in dict.fromkeys((int(half), int(light[-1])))]
+    if len(picked) < LEAST_SCANS:
+        raise DatasetError(
+            f"{len(presses)} presses with {len(picked)} scans below {most_counts:.0f} counts in the sum of z, expected "
+            f"{LEAST_SCANS} or more: press the ball alone, slowly, all over the pad, which is free in between"
+        )
+    return np.array(picked[:: -(-len(picked) // MOST_SCANS)], dtype=np.float64)
+
+
+def fit_ball(presses: Sequence[NDArray[np.floating]], diameter_mm: float, known: SensorPad) -> SensorPad:
     """Return constants of the pad that explains presses of a ball best, with 90 % intervals.
 
     Args:
-        counts: readings (n, 3, rows, cols) of the presses in counts, zeroed on the pad that was free just before.
+        presses: scans (n, 3, rows, cols) of each from first touch on, in counts over the pad that was free just before.
         diameter_mm: of the ball, in [mm].
         known: of the sensor; of constants alone those with an interval.
 
     Raises:
-        DatasetError: no pad that is simulated reads so.
+        DatasetError: they are too few, or no pad that is simulated reads so.
     """
-    presses = _Presses(counts, diameter_mm, known)
-    count = _OF_PAD + CHANNELS + len(counts) * _OF_PRESS
-    bound = np.concatenate([presses.bound, np.full(count - _OF_PAD, 4.0)])
-    slopes: Any = presses.slopes  # which the types of scipy do not know as a Jacobian
+    fit = _Presses(presses, diameter_mm, known)
+    count = _OF_PAD + CHANNELS + len(fit.counts) * _OF_PRESS
+    bound = np.concatenate([fit.bound, np.full(count - _OF_PAD, 4.0)])
+    slopes: Any = fit.slopes  # which the types of scipy do not know as a Jacobian
     fitted = least_squares(
-        presses.residuals, np.zeros(count), jac=slopes, bounds=(-bound, bound), ftol=1e-3, xtol=1e-3, max_nfev=25
+        fit.residuals, np.zeros(count), jac=slopes, bounds=(-bound, bound), ftol=1e-3, xtol=1e-3, max_nfev=25
     )
-    read = np.isfinite(presses.error).ravel()
+    read = np.isfinite(fit.error).ravel()
     misfit = float(np.square(fitted.fun[: read.size][read]).mean())
     if misfit > MOST_MISFIT:
         raise DatasetError(
             f"no pad reads presses of a ball of {diameter_mm:g} mm like these (misfit {misfit:.0f}, expected at most "
             f"{MOST_MISFIT:g}): measure the ball, and press it alone, straight down, with the pad free in between"
         )
-    off = float(fitted.x[_OF_PAD - 1])
-    if abs(off) > 3:
+    # Too large or too small a ball is explained by another modulus, then by another force than was weighed.
+    of_scale = [*map(list(RANGES).index, ("shear_modulus_mpa", "counts_per_newton")), _OF_PAD - 1]
+    if float(np.square(fitted.x[of_scale]).sum()) > _MOST_CONTRADICTION:
         raise DatasetError(
-            f"the presses are of a ball {'larger' if off > 0 else 'smaller'} than {diameter_mm:g} mm: measure its "
-            "diameter, and press it alone, straight down, with the pad free in between"
+            f"a ball of {diameter_mm:g} mm and the counts per newton contradict each other: measure that diameter, "
+            "press it alone, straight down, and lay the weight on the whole pad"
         )
     deviation = np.sqrt(np.diag(np.linalg.inv(fitted.jac.T @ fitted.jac)) * max(misfit, 1.0))[:_OF_PAD]
-    half = _WIDENING * LEVEL_90 * presses.spread * deviation
-    values = presses.parts(fitted.x)[0]
+    half = _WIDENING * LEVEL_90 * fit.spread * deviation
+    values = fit.parts(fitted.x)[0]
     constants: dict[str, float] = {}
     intervals: dict[str, tuple[float, float]] = {}
     for name, value, wide in zip(RANGES, values.tolist(), half.tolist(), strict=False):
