@@ -54,7 +54,8 @@ def page(findings: Sequence[Finding], columns: int) -> str:
     indent = " " * 8
     for sensor in dict.fromkeys(finding.sensor for finding in findings):
         lines.append("link" if sensor is None else f"sensor {sensor}")
-        for finding in (one for one in findings if one.sensor == sensor):
+        of_sensor = [finding for finding in findings if finding.sensor == sensor]
+        for finding in of_sensor:
             norm = f" (norm: {finding.norm})" if finding.norm else ""
             text = f"{finding.name}: {finding.measured}{norm}"
             lines += wrapped(text, columns, f"  {marks[finding.verdict]:6}", indent)
