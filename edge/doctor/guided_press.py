@@ -189,15 +189,14 @@ def judge_force(weighed: Weighed | None, *, kept: bool) -> Finding:
         remedy = (
             "no sensor reads so, and it is not kept: does the weight have the grams typed, and rest on the pad alone?"
         )
-        return Finding("force", "look", measured, norm, remedy)
-    if error > COVERED_ERROR:
+    elif error > COVERED_ERROR:
         remedy = "it bears on a part of the pad: lay it on something flat that covers all of it, and weigh both"
-        return Finding("force", "look", measured, norm, remedy)
-    if not low <= counts_per_newton <= high:
+    elif not low <= counts_per_newton <= high:
         remedy = "is the weight as heavy as was typed, and does it lie on the pad alone?"
-        return Finding("force", "look", measured, norm, remedy)
-    use = "" if kept else f"edge-sr --counts-per-newton {counts_per_newton:.0f}"
-    return Finding("force", "ok", measured, norm, use)
+    else:
+        use = "" if kept else f"edge-sr --counts-per-newton {counts_per_newton:.0f}"
+        return Finding("force", "ok", measured, norm, use)
+    return Finding("force", "look", measured, norm, remedy)
 
 
 FREE_SCANS: Final = 20
