@@ -85,24 +85,24 @@ def show_devices(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 
     Raises DeviceError if no adapter is among them.
     """
-    found, notes = devices()
+    listed, notes = devices()
     if options.json:
-        out.write(json.dumps({"devices": [one._asdict() for one in found], "notes": notes}, indent=1) + "\n")
+        out.write(json.dumps({"devices": [device._asdict() for device in listed], "notes": notes}, indent=1) + "\n")
     else:
-        out.write("".join(f"{line}\n" for line in page(found, notes, columns())))
-    if not any(one.adapter for one in found):
+        out.write("".join(f"{line}\n" for line in page(listed, notes, columns())))
+    if not any(device.adapter for device in listed):
         raise DeviceError(NOTHING)
 
 
-def page(found: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
+def page(listed: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
     """Return lines for a reader, adapters first; only text to be typed and longer words are wider than `width`."""
     lines: list[str] = []
-    for one in sorted(found, key=lambda one: not one.adapter):
-        serial = f"serial {one.serial_number}" if one.serial_number else None
-        lines += wrapped("  ".join(word for word in (one.path, one.usb_id, serial) if word), width, indent="  ")
-        lines += wrapped(f"{'looks like ' if one.adapter else ''}{one.looks_like}", width, "  ", "  ")
-        lines.append(f"  --source {as_typed(one.source)}")
-        for problem in one.problems:
+    for device in sorted(listed, key=lambda device: not device.adapter):
+        serial = f"serial {device.serial_number}" if device.serial_number else None
+        lines += wrapped("  ".join(word for word in (device.path, device.usb_id, serial) if word), width, indent="  ")
+        lines += wrapped(f"{'looks like ' if device.adapter else ''}{device.looks_like}", width, "  ", "  ")
+        lines.append(f"  --source {as_typed(device.source)}")
+        for problem in device.problems:
             lines += wrapped(problem, width, "  ! ", "    ")
     for note in (*notes, SERVER_HINT):
         lines += wrapped(note, width)
