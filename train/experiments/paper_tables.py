@@ -92,12 +92,6 @@ def trained(bench: Workbench, training: Training, data: PressSet, validation: Fr
     return bench.network(training, data, validation)
 
 
-def compact_methods(bench: Workbench, data: PressSet, names: Sequence[str]) -> list[Method]:
-    """Return compact networks by name (stsr, mtsr2, ...), trained on `data` where no checkpoint exists."""
-    validation = bench.frozen("validation")
-    return [replace(trained(bench, compact(name), data, validation), name=name) for name in names]
-
-
 def classical_methods(bench: Workbench, data: PressSet, names: Sequence[str]) -> list[Method]:
     """Return methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
     path = bench.data_folder / f"classical-{data.sha256()[:10]}.npz"

@@ -80,11 +80,11 @@ def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArra
     return flat / np.maximum(scale, 1.0), usable
 
 
-def scaled_constants(pad: Pad, cross_talk: float = 0.5) -> NDArray[np.float64]:
-    """Return CONSTANTS of a pad over half of their ranges, (p,); `cross_talk` is a share of the largest."""
+def scaled_constants(pad: Pad) -> NDArray[np.float64]:
+    """Return CONSTANTS of a pad over half of their ranges, (p,); the last is of its sensor, and in the middle."""
     bounds = ((name, *RANGES[name]) for name in CONSTANTS[:-1])
     scaled = [2 * (getattr(pad, name) - low) / (high - low) - 1 for name, low, high in bounds]
-    return np.array([*scaled, 2 * cross_talk - 1])
+    return np.array([*scaled, 0.0])
 
 
 def place_effects(pad: Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -122,17 +122,17 @@ def even_contacts(presses: PressSet, seed: int) -> tuple[NDArray[np.float64], ND
     return contacts[usable], constants[usable]
 
 
-def fit_mixture(presses: PressSet, seed: int = 0) -> ContactMixture:
+def fit_mixture(presses: PressSet) -> ContactMixture:
     """Fit the mixture by expectation-maximisation to presses, as of `even_contacts`.
 
     DatasetError if they are fewer than two for each channel.
     """
-    contacts, constants = even_contacts(presses, seed)
+    contacts, constants = even_contacts(presses, seed=0)
     design = np.insert(constants, 0, 1.0, axis=1)
     components = min(48, len(contacts) // (2 * CHANNELS))
     if not components:
         raise DatasetError(f"{len(contacts)} presses strong enough, expected {2 * CHANNELS} or more: make more")
-    mixture = _fitted(contacts, design, _nearest(contacts, np.random.default_rng(seed), components))
+    mixture = _fitted(contacts, design, _nearest(contacts, np.random.default_rng(0), components))
     for _ in range(_ROUNDS):
         mixture = _fitted(contacts, design, _given_constants(mixture, contacts, design))
     return mixture

@@ -30,6 +30,7 @@ from train.physics.sensor_noise import Nuisances
 
 LEVEL: Final = 0.9
 LEVELS: Final = (0.5, 0.8, 0.9, 0.95)
+_SEED: Final = 0  # of the fit of a correction
 _SAMPLES: Final = 24  # pixels of each region of a window
 _RATE: Final = 5e-3
 _LEAST_RATIO: Final = 1e-3
@@ -97,12 +98,12 @@ def readings_of_presses(
     return found
 
 
-def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, seed: int = 0, steps: int = 2000) -> None:
+def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, steps: int = 2000) -> None:
     """Add a correction to a trained network in evaluation mode, fitted on presses, some of them with all its taps."""
-    torch.manual_seed(seed)
+    torch.manual_seed(_SEED)
     correction = net.add_intervals()
     correction.contact_level.fill_(contact_level)
-    summary, later, ratios = _samples(net, correction, presses, seed)
+    summary, later, ratios = _samples(net, correction, presses)
     spread = summary.std(dim=0)
     correction.centre.copy_(summary.mean(dim=0))
     correction.spread.copy_(torch.where(spread > 1e-3, spread, torch.ones_like(spread)))
@@ -163,11 +164,9 @@ def _ratios(
     return [np.concatenate(part) for part in parts]
 
 
-def _samples(
-    net: CompactNet, correction: IntervalCorrection, presses: PressSet, seed: int
-) -> tuple[Tensor, Tensor, Tensor]:
+def _samples(net: CompactNet, correction: IntervalCorrection, presses: PressSet) -> tuple[Tensor, Tensor, Tensor]:
     """Return inputs of the factors (n, ...), taps (n, K - 1), and logarithms of errors over half widths (n, 4, m)."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     presses = presses if net.takes_poses or net.taps == 1 else presses.only_turned()
     whole = presses.with_taps(net.taps)
     usable = np.flatnonzero(whole.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps >= net.taps))
@@ -177,7 +176,7 @@ def _samples(
     chosen = whole.pick(rng.permutation(np.concatenate(kept))) if kept else whole
     at_once = min(512, len(chosen))
     batches = PosedBatches if net.takes_poses else PressBatches
-    draw = batches(chosen, (1 / net.taps,) * net.taps, at_once, seed)
+    draw = batches(chosen, (1 / net.taps,) * net.taps, at_once, _SEED)
     unit = float(half_width_mm(1.0))
     found: list[tuple[Any, ...]] = []
     # Two sensors read each press.
