@@ -165,18 +165,23 @@ def _plain(held: Any) -> Any:
     return held.plain if isinstance(held, _Array) else held
 
 
+_CORE: Final = {"_reconstruct": _Array, "scalar": lambda number, held: number.read(held)[0]}
+_CONSTRUCTORS: Final[dict[str, dict[str, Any]]] = {
+    "numpy": {"dtype": _Number, "ndarray": object},
+    "numpy.core.multiarray": _CORE,
+    "numpy._core.multiarray": _CORE,
+}
+"""Stand-ins for the constructors that numpy's pickles name, by their modules."""
+
+
 class _Arrays(pickle.Unpickler):
     """Unpickler of lists, dicts, numbers and arrays, which calls none of what a pickle names."""
 
     def find_class(self, module: str, name: str) -> Any:
         """Return what stands for a constructor of numpy's pickles; anything else is refused."""
-        core = module in ("numpy.core.multiarray", "numpy._core.multiarray")
-        if core and name == "scalar":
-            return lambda number, held: number.read(held)[0]
-        known = {"_reconstruct": _Array} if core else {"dtype": _Number, "ndarray": object} if module == "numpy" else {}
-        if name not in known:
+        if name not in _CONSTRUCTORS.get(module, {}):
             raise pickle.UnpicklingError(f"it calls {module}.{name}")
-        return known[name]
+        return _CONSTRUCTORS[module][name]
 
 
 def _published_taps(path: Path) -> list[RecordedTap]:
