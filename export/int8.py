@@ -68,7 +68,7 @@ def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
 class _Inputs(CalibrationDataReader):
     def __init__(self, inputs: dict[str, NDArray[np.float32]]) -> None:
         count = len(inputs[INPUT_NAME])
-        self._left = ({name: given[one : one + 1] for name, given in inputs.items()} for one in range(count))
+        self._left = ({name: given[row : row + 1] for name, given in inputs.items()} for row in range(count))
 
     def get_next(self) -> dict[str, NDArray[np.float32]] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         return next(self._left, None)

@@ -62,7 +62,7 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
     if path.suffix == ".npy":
         return _published_taps(path)
     recording = load_recording(path)
-    tracks = {one.sensor: one for one in recording.tracks}
+    tracks = {track.sensor: track for track in recording.tracks}
     track = recording.tracks[0] if len(tracks) == 1 else tracks.get(sensor)
     if track is None:
         raise DatasetError(f"{path} has the sensors {', '.join(tracks)}, none of them {sensor}")
@@ -75,7 +75,7 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
     mounting = recording.mountings.get(track.sensor, entry.mounting)
     counts = np.nan_to_num(np.stack([deformation(scan, rest, mounting) for scan in raw]))
     times = track.time_ns if track.time_ns is not None and not recording.poses_by_row else np.arange(len(raw))
-    poses = iter([one for one in recording.poses if one.sensor in (None, track.sensor)])
+    poses = iter([pose for pose in recording.poses if pose.sensor in (None, track.sensor)])
     course, due, taps = PoseTrack(), next(poses, None), []
     for frames, peak in _cut(counts):
         time = int(times[peak])
@@ -191,8 +191,8 @@ def _published_taps(path: Path) -> list[RecordedTap]:
     file = io.BytesIO(path.read_bytes())
     try:
         (npy.read_array_header_1_0 if npy.read_magic(file) == (1, 0) else npy.read_array_header_2_0)(file)
-        held = [_plain(one) for one in _Arrays(file).load().plain]
-        return [_published_tap(one[0] if isinstance(one, list) else one) for one in held]
+        held = [_plain(tap) for tap in _Arrays(file).load().plain]
+        return [_published_tap(tap[0] if isinstance(tap, list) else tap) for tap in held]
     except Exception as error:  # a pickle raises any exception on broken bytes, and each means that the file is broken
         said = " ".join(str(error).split())[:120] or type(error).__name__
         raise DatasetError(f"{path} is not a file of published taps, or a damaged or hostile one: {said}") from error
@@ -289,13 +289,13 @@ def placed(taps: Sequence[RecordedTap], surface: Surface, pad: GrippedPad) -> Pl
         slopes = np.stack([(made(moved + step) - now).ravel() / step.sum() for step in np.diag(_STEPS)], axis=1)
         moved = moved + np.linalg.lstsq(slopes, (wanted - now).ravel(), rcond=1e-3)[0].clip(-2, 2)
         now = made(moved)
-    found = Placed(moved, (before, float(np.median((now * wanted).sum(axis=1)))))
-    if not found.likeness[1] >= LEAST_LIKENESS:
+    fitted = Placed(moved, (before, float(np.median((now * wanted).sum(axis=1)))))
+    if not fitted.likeness[1] >= LEAST_LIKENESS:
         raise DatasetError(
-            f"the readings do not fit what lies under the poses: likeness {found.likeness[1]:.2f}, at least "
+            f"the readings do not fit what lies under the poses: likeness {fitted.likeness[1]:.2f}, at least "
             f"{LEAST_LIKENESS} expected; are the poses those of this surface, from its middle, in mm, y down?"
         )
-    return found
+    return fitted
 
 
 def _shape(z: NDArray[np.floating]) -> NDArray[np.float64]:

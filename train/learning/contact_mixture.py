@@ -144,7 +144,7 @@ Sensor = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
 
 def sensors_of(presses: PressSet, world: World) -> list[Sensor]:
     """Return the sensors that read the presses of a world, one for each pad, with chips of their own."""
-    found: list[Sensor] = []
+    sensors: list[Sensor] = []
     spread, read_by = Nuisances().gain_spread, Nuisances().without("gain_spread")
     # Sets number their pads with gaps, in the order in which they were drawn.
     for number, pad_number in zip(range(world.chunks), np.unique(presses.pad), strict=True):
@@ -156,8 +156,8 @@ def sensors_of(presses: PressSet, world: World) -> list[Sensor]:
         true -= true[AXES.index("z")].mean()
         clean = presses.pick(presses.pad == pad_number).counts[:, 0] * chips.astype(np.float32)
         contacts = apply_nuisances(clean[None, :, None], read_by, [world.seed, number])[0, :, 0]
-        found.append((contacts, true.ravel(), scaled_constants(pad)))
-    return found
+        sensors.append((contacts, true.ravel(), scaled_constants(pad)))
+    return sensors
 
 
 def _even_z(gripped: GrippedPad) -> NDArray[np.float64]:
@@ -169,13 +169,16 @@ def _even_z(gripped: GrippedPad) -> NDArray[np.float64]:
 def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactModel:
     """Return the model with its mean error on sensors taken out, and with intervals that hold nine in ten values."""
     plain = [learned(contacts, mixture.model(), 1) for contacts, _, _ in sensors]
-    off = [np.log(one.gains) - true for one, (_, true, _) in zip(plain, sensors, strict=True)]
+    off = [np.log(learner.gains) - true for learner, (_, true, _) in zip(plain, sensors, strict=True)]
     bias = _symmetric(np.mean(off, axis=0))
     taught = [learned(contacts, mixture.model(1.0, bias), 1) for contacts, _, _ in sensors]
-    gains = [(np.log(one.gains) - true) / one.deviations for one, (_, true, _) in zip(taught, sensors, strict=True)]
+    gains = [
+        (np.log(learner.gains) - true) / learner.deviations
+        for learner, (_, true, _) in zip(taught, sensors, strict=True)
+    ]
     constants = [
-        ((one.constants - true) / one.constant_deviations)[:-1][one.determined[:-1]]
-        for one, (_, _, true) in zip(taught, sensors, strict=True)  # the cross-talk of a sensor is not available
+        ((learner.constants - true) / learner.constant_deviations)[:-1][learner.determined[:-1]]
+        for learner, (_, _, true) in zip(taught, sensors, strict=True)  # the cross-talk of a sensor is not available
     ]
     return mixture.model(_widening(gains), bias, _widening(constants))
 

@@ -83,7 +83,7 @@ def readings_of_presses(
     Of `sensor` is known what its file states, and nothing.
     """
     presses = presses if posed or taps == 1 else presses.only_turned()
-    found = []
+    readings = []
     for number in range(times):
         frozen = freeze_presses(presses, SEED + number, Nuisances() if sensor is None else sensor.nuisances)
         poses = None
@@ -94,8 +94,8 @@ def readings_of_presses(
             pads = frozen.pads(known=known)
             if sensor is not None:
                 pads[:] = known * np.array(sensor.row)
-            found.append(Readings(windows, pads, frozen.patterns(), poses))
-    return found
+            readings.append(Readings(windows, pads, frozen.patterns(), poses))
+    return readings
 
 
 def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, steps: int = 2000) -> None:
@@ -134,17 +134,17 @@ def conform(net: CompactNet, run: Run, readings: Sequence[Readings]) -> dict[str
     pooled: list[list[NDArray[np.floating]]] = [[] for _ in REGIONS]
     for given in tracked(range(1, net.taps + 1), "intervals", "taps"):
         ratios = _ratios(correction, run, given, readings)
-        wanted = [float(np.quantile(one, LEVEL, method="higher")) if one.size else 1.0 for one in ratios]
+        wanted = [float(np.quantile(region, LEVEL, method="higher")) if region.size else 1.0 for region in ratios]
         shift = torch.tensor(wanted).clamp_min(_LEAST_RATIO).log()
         correction.shift(given, shift)
-        for parts, one, by in zip(pooled, ratios, shift.exp().tolist(), strict=True):
-            parts.append(one / by)
-    found = [np.concatenate(parts) for parts in pooled]
+        for parts, region, by in zip(pooled, ratios, shift.exp().tolist(), strict=True):
+            parts.append(region / by)
+    scaled = [np.concatenate(parts) for parts in pooled]
     return {
         f"{100 * level:g}": [
             # Half of the pixels far from a contact may be exact zeros, as the truth is.
-            float(f"{unit * max(np.quantile(one, level), _LEAST_RATIO):.4g}") if one.size else unit
-            for one in found
+            float(f"{unit * max(np.quantile(region, level), _LEAST_RATIO):.4g}") if region.size else unit
+            for region in scaled
         ]
         for level in LEVELS
     }
@@ -155,9 +155,9 @@ def _ratios(
 ) -> list[NDArray[np.floating]]:
     """Return errors over half widths in each region, with the newest `given` taps."""
     parts: list[list[NDArray[np.floating]]] = [[] for _ in REGIONS]
-    for one in readings:
-        pattern, deviation = run(one.with_taps(given), one.pads, one.poses)[:2]
-        ratio = np.abs(pattern - one.truth) / half_width_mm(deviation)
+    for reading in readings:
+        pattern, deviation = run(reading.with_taps(given), reading.pads, reading.poses)[:2]
+        ratio = np.abs(pattern - reading.truth) / half_width_mm(deviation)
         region = regions(pattern, float(correction.contact_level), correction.near)
         for number, part in enumerate(parts):
             part.append(ratio[region == number])
@@ -178,7 +178,7 @@ def _samples(net: CompactNet, correction: IntervalCorrection, presses: PressSet)
     batches = PosedBatches if net.takes_poses else PressBatches
     draw = batches(chosen, (1 / net.taps,) * net.taps, at_once, _SEED)
     unit = float(half_width_mm(1.0))
-    found: list[tuple[Any, ...]] = []
+    samples: list[tuple[Any, ...]] = []
     # Two sensors read each press.
     for number in tracked(range(max(2 * len(chosen) // at_once, 1)), "intervals", "batch"):
         batch = draw(number)
@@ -189,9 +189,9 @@ def _samples(net: CompactNet, correction: IntervalCorrection, presses: PressSet)
             _, summary = correction.summary(seen.features, pattern, seen.deviation, seen.about, seen.later)
             error = (pattern - batch.pattern / seen.newest).abs() + 1e-6
             region = regions(pattern.numpy(), float(correction.contact_level), correction.near)
-            found.append((summary, seen.later, _drawn(torch.log(error / (seen.deviation * unit)), region)))
+            samples.append((summary, seen.later, _drawn(torch.log(error / (seen.deviation * unit)), region)))
     # A copy, because tensors of inference take no gradient.
-    inputs, later, ratios = (torch.cat(parts).clone() for parts in zip(*found, strict=True))
+    inputs, later, ratios = (torch.cat(parts).clone() for parts in zip(*samples, strict=True))
     return inputs, later, ratios
 
 
