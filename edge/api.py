@@ -16,15 +16,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from edge.errors import (
-    EdgeError,
-    ModelError,
-    NoResultError,
-    SinkClosedError,
-    SinkError,
-    UsageError,
-    WindowError,
-)
+from edge.errors import EdgeError, ModelError, NoResultError, SinkClosedError, SinkError, UsageError, WindowError
 from edge.inference.bundled import (
     DEFAULT_MODEL,
     POSED_MODEL,

@@ -26,12 +26,7 @@ import torch
 from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
-from edge.inference.contract import (
-    INPUT_NAME,
-    PAD_NAME,
-    POSES_NAME,
-    Contract,
-)
+from edge.inference.contract import INPUT_NAME, PAD_NAME, POSES_NAME, Contract
 from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.graph import ExportError
 from firmware_bridge.pad_geometry import AXES
