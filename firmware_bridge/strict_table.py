@@ -20,7 +20,7 @@ class Table:
         """
         self._path, self._name, self._error, self._remedy = path, name, error, remedy
         self._values = dict(values)
-        self._known: list[str] = []
+        self._taken: list[str] = []
 
     def part(self, key: str, values: Mapping[str, Any]) -> "Table":
         """Return a table in this one."""
@@ -28,7 +28,7 @@ class Table:
 
     def take(self, key: str, read: Callable[[Any], Any], *, required: bool = True) -> Any:
         """Return the value of a key, None if an optional one is missing; errors of `read` state what it expected."""
-        self._known.append(key)
+        self._taken.append(key)
         if key not in self._values:
             return self.refuse(key, "missing", "it to be there") if required else None
         value = self._values.pop(key)
@@ -40,7 +40,7 @@ class Table:
     def end(self) -> None:
         """Refuse keys that were not taken."""
         for key in self._values:
-            self.refuse(key, "not known", f"one of {', '.join(self._known)}")
+            self.refuse(key, "not known", f"one of {', '.join(self._taken)}")
 
     def refuse(self, key: str, got: str, expected: str) -> NoReturn:
         """Raise the error of a key, with its value, the expected one and the remedy."""
