@@ -168,7 +168,8 @@ class Visit:
                 if scan.sensor == name:
                     received_s = time.monotonic()
                     requests.append(guide.push(deformation(scan.counts, baseline, mounting), scan.time_ns / NS_PER_S))
-            if (line := self._typed_line()) is not None:
+            line = typed_line() if self._rehearsal is None else self._rehearsal.typed_line()
+            if line is not None:
                 requests.append(guide.type(line))
             for asked in filter(None, requests):
                 self._ask(whose, asked)
@@ -181,9 +182,6 @@ class Visit:
         self._say(whose + request)
         if self._rehearsal is not None:
             self._rehearsal.answer(request)
-
-    def _typed_line(self) -> str | None:
-        return typed_line() if self._rehearsal is None else self._rehearsal.typed_line()
 
     def _show_load(self, felt: float, left_s: float) -> None:
         """Show the load, as a share of that of a press, in a line that is rewritten in place."""
