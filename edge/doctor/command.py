@@ -271,6 +271,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
             except SensorFileError as error:
                 failed = error
         stopped_s = time.monotonic() - start_s if stop.is_set() else None
+        verdict = worst(finding.verdict for finding in examined.findings)
         if options.json:
             document = {
                 "source": link.name,
@@ -278,7 +279,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
                 "id_map": sensor_file.model,
                 "duration_s": round(watched.duration_s, 3),
                 "stopped": stopped_s is not None,
-                "verdict": worst(examined.findings),
+                "verdict": verdict,
                 "findings": [asdict(finding) for finding in examined.findings],
                 "sensor_file": str(options.out) if kept else None,
             }
@@ -299,7 +300,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
             if options.out is not None and not kept:
                 print(f"{options.out}: not written, because the free pad was not measured to the end", file=err)
             return 130
-    return 1 if visit.unfinished or worst(examined.findings) == "wrong" else 0
+    return 1 if visit.unfinished or verdict == "wrong" else 0
 
 
 def check_writable(path: Path, sensor_file: SensorFile) -> None:

@@ -32,10 +32,10 @@ def graded(value: float, look: float, wrong: float) -> Verdict:
     return "ok" if value <= look else "look" if value <= wrong else "wrong"
 
 
-def worst(findings: Iterable[Finding]) -> Verdict:
+def worst(verdicts: Iterable[Verdict]) -> Verdict:
     """Return the gravest verdict; "not known" counts as ok."""
-    verdicts = {finding.verdict for finding in findings}
-    return "wrong" if "wrong" in verdicts else "look" if "look" in verdicts else "ok"
+    present = set(verdicts)
+    return "wrong" if "wrong" in present else "look" if "look" in present else "ok"
 
 
 def summary(findings: Iterable[Finding]) -> str:

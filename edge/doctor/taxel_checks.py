@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.findings import Finding, graded, judged
+from edge.doctor.findings import Finding, graded, judged, worst
 from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.result import NOISE_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
@@ -152,8 +152,7 @@ def check_noise(samples: Samples) -> Finding:
     if np.isnan(noise).all():
         return Finding("noise", "not known", "no taxel sends new readings")
     largest = np.nanmax(noise, axis=1)
-    verdicts = {graded(most, *limits) for most, limits in zip(largest, NOISE_LIMITS_COUNTS, strict=True)}
-    verdict = "wrong" if "wrong" in verdicts else "look" if "look" in verdicts else "ok"
+    verdict = worst(graded(most, *limits) for most, limits in zip(largest, NOISE_LIMITS_COUNTS, strict=True))
     limits = np.asarray(NOISE_LIMITS_COUNTS)[:, :1]
     axis, taxel = _farthest(noise / limits)
     medians = ", ".join(f"{name} {np.nanmedian(plane):.1f}" for name, plane in zip(AXES, noise, strict=True))
