@@ -282,12 +282,10 @@ def _adapters(backend: IBackend | None) -> Sequence[tuple[GsUsbDevice, usb.core.
     if backend is None:
         raise DeviceError("libusb cannot be loaded: pip install libusb-package, or apt install libusb-1.0-0")
     try:
-        attached = list(usb.core.find(find_all=True, backend=backend) or ())
+        seen = list(usb.core.find(find_all=True, backend=backend) or ())
     except (usb.core.USBError, NotImplementedError) as error:
         raise DeviceError(f"USB cannot be read: {error}") from error
-    devices = [
-        device for device in attached if isinstance(device, usb.core.Device) and _usb_id(device) in GS_USB_ADAPTERS
-    ]
+    devices = [device for device in seen if isinstance(device, usb.core.Device) and _usb_id(device) in GS_USB_ADAPTERS]
     return sorted(((_describe(device), device) for device in devices), key=lambda pair: pair[0][:2])
 
 
