@@ -16,15 +16,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from edge.errors import (
-    EdgeError,
-    ModelError,
-    NoResultError,
-    SinkClosedError,
-    SinkError,
-    UsageError,
-    WindowError,
-)
+from edge.errors import EdgeError, ModelError, NoResultError, SinkClosedError, SinkError, UsageError, WindowError
 from edge.inference.bundled import (
     DEFAULT_MODEL,
     POSED_MODEL,
@@ -145,7 +137,7 @@ def open_source(
         check_positive("rate_hz", rate_hz)
     if not give_up_s >= 0:
         raise UsageError(f"give_up_s is {give_up_s}, expected 0 or more")
-    known = sensor_settings(sensor, id_map)
-    links = links_to(texts, known, rate_hz=rate_hz)
-    settings = with_recorded(known, links)
-    return Source(*links, sensor_file=settings, rate_hz=rate_hz, force=force, give_up_s=give_up_s)
+    sensor_file = sensor_settings(sensor, id_map)
+    links = links_to(texts, sensor_file, rate_hz=rate_hz)
+    recorded = with_recorded(sensor_file, links)
+    return Source(*links, sensor_file=recorded, rate_hz=rate_hz, force=force, give_up_s=give_up_s)

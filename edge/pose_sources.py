@@ -186,7 +186,7 @@ class Ros2Poses:
         kinds = [TYPES[f"geometry_msgs/{name}"] for name in names]
         self._readers = [(reader(self._participant, topic, kind, _KEPT, reliable=False), kind) for kind in kinds]
         state = SampleState.NotRead | ViewState.Any | InstanceState.Any
-        self._conditions = [ReadCondition(one, state) for one, _ in self._readers]
+        self._conditions = [ReadCondition(topic_reader, state) for topic_reader, _ in self._readers]
         for condition in self._conditions:
             self._waiting.attach(condition)
         self._ended, self._taken, self._second = False, taken, duration(seconds=1)

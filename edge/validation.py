@@ -71,8 +71,8 @@ def check_mountings(mountings: Mapping[str, Mounting], geometry: SensorGeometry)
 
 def check_counts_per_newton(counts: float | Mapping[str, float] | None) -> None:
     """Check that counts per newton, of all sensors or by name, are such as a pad may have."""
-    for name, one in _named("counts_per_newton", counts):
-        check_positive(name, one, *PAD_RANGES["counts_per_newton"])
+    for name, value in _named("counts_per_newton", counts):
+        check_positive(name, value, *PAD_RANGES["counts_per_newton"])
 
 
 def _named(what: str, setting: Any) -> Iterable[tuple[str, Any]]:

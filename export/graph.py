@@ -92,7 +92,7 @@ def outputs(
 
     Without `pads` all constants are absent, without `poses` they are those of the paper's schedule.
     """
-    known = {"pad": pads, "poses": poses}
+    stated = {"pad": pads, "poses": poses}
     with torch.inference_mode():
-        given = net(windows, **{name: one for name, one in known.items() if one is not None})
+        given = net(windows, **{name: values for name, values in stated.items() if values is not None})
     return given if isinstance(given, tuple) else (given,)

@@ -26,12 +26,7 @@ import torch
 from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
-from edge.inference.contract import (
-    INPUT_NAME,
-    PAD_NAME,
-    POSES_NAME,
-    Contract,
-)
+from edge.inference.contract import INPUT_NAME, PAD_NAME, POSES_NAME, Contract
 from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.graph import ExportError
 from firmware_bridge.pad_geometry import AXES
@@ -68,7 +63,7 @@ def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
 class _Inputs(CalibrationDataReader):
     def __init__(self, inputs: dict[str, NDArray[np.float32]]) -> None:
         count = len(inputs[INPUT_NAME])
-        self._left = ({name: given[one : one + 1] for name, given in inputs.items()} for one in range(count))
+        self._left = ({name: given[row : row + 1] for name, given in inputs.items()} for row in range(count))
 
     def get_next(self) -> dict[str, NDArray[np.float32]] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         return next(self._left, None)

@@ -104,7 +104,7 @@ class GraphRun:
 
 def run_network(net: PatternNet, *given: NDArray[np.float32] | None) -> list[NDArray[np.float32]]:
     """Return each output of a network for windows, pads and poses, as a `GraphRun` does of its graph."""
-    parts = [None if one is None else torch.from_numpy(one).split(256) for one in given]
+    parts = [None if arrays is None else torch.from_numpy(arrays).split(256) for arrays in given]
     count = max(len(part) for part in parts if part is not None)
     runs = [outputs(net, *part) for part in zip(*(part or [None] * count for part in parts), strict=True)]
     return [torch.cat(maps).numpy() for maps in zip(*runs, strict=True)]
@@ -123,7 +123,7 @@ def differences(
     shapes = [[maps.shape for maps in given] for given in (expected, got)]
     if shapes[0] != shapes[1]:
         raise ParityError(f"outputs of shape {shapes[1]}, expected {shapes[0]}")
-    found = []
+    measured = []
     sizes = {name: np.abs(maps).reshape(len(maps), -1).max(axis=1) for name, maps in zip(names, expected, strict=True)}
     for name, true, mine in zip(names, expected, got, strict=True):
         if not np.isfinite(true).all():
@@ -133,12 +133,12 @@ def differences(
         same_unit = [size for other, size in sizes.items() if (other == TRACTION_NAME) == (name == TRACTION_NAME)]
         # Differences of small tractions are relative to that of 40 N evenly on the pad, in [kPa].
         unit = {OUTPUT_NAME: full_scale, TRACTION_NAME: 100.0}.get(name, 0.0)
-        apart = np.abs(mine - true).reshape(len(true), -1)
         # Around a pixel that changes regions a deviation is another one: one pixel in ten may be so.
-        apart = np.quantile(apart, 0.9, axis=1, method="higher") if name == DEVIATION_NAME else apart.max(axis=1)
-        relative = apart / np.maximum(unit, np.max(same_unit, axis=0))
-        found.append(Difference(name, float(apart.max()), float(relative.max())))
-    return found
+        share = 0.9 if name == DEVIATION_NAME else 1.0
+        distance = np.quantile(np.abs(mine - true).reshape(len(true), -1), share, axis=1, method="higher")
+        relative = distance / np.maximum(unit, np.max(same_unit, axis=0))
+        measured.append(Difference(name, float(distance.max()), float(relative.max())))
+    return measured
 
 
 def accepted(output: str, tolerance: float) -> float:

@@ -211,7 +211,7 @@ def judge_in_contract(session: ModelSession, frozen: FrozenSet, validation: Coll
             parts.append(f"interval covers {error['coverage_90']:.1%}")
     else:
         parts.append(f"not evaluated, the test set is of x{frozen.scale}")
-    fitting = [one for one in validation if one.scale == contract.scale]
+    fitting = [frozen_set for frozen_set in validation if frozen_set.scale == contract.scale]
     if fitting and session.deviation is not None:
         contract.confidence.update(fit_confidence(session, fitting))
     return parts
@@ -227,8 +227,8 @@ def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[
         [doubts_and_errors(model, given, frozen) for given in range(1, taps + 1)]
         for frozen in tracked(sets, "confidence", "set")
     ]
-    found = [np.concatenate([part[given] for part in parts], axis=1) for given in range(taps)]
-    rows = {str(given): _row(found[given - 1 : given + 1]) for given in range(1, taps + 1)}
+    by_taps = [np.concatenate([part[given] for part in parts], axis=1) for given in range(taps)]
+    rows = {str(given): _row(by_taps[given - 1 : given + 1]) for given in range(1, taps + 1)}
     return {given: row for given, row in rows.items() if row["doubt"]}  # empty if no pattern exceeds zero
 
 
@@ -258,8 +258,8 @@ def _rising(bins: list[NDArray[np.intp]], about: NDArray[np.float64]) -> list[ND
     return joined
 
 
-def _row(found: list[NDArray[np.float64]]) -> dict[str, list[float]]:
-    about, error, size = found[0]
+def _row(by_taps: list[NDArray[np.float64]]) -> dict[str, list[float]]:
+    about, error, size = by_taps[0]
     seen = size > 0  # a pattern of zeros has no uncertainty relative to its size
     about, share = about[seen], error[seen] / size[seen]
     bins = _rising([part for part in np.array_split(np.argsort(about), BINS) if part.size], about)
@@ -268,8 +268,8 @@ def _row(found: list[NDArray[np.float64]]) -> dict[str, list[float]]:
         "error": [float(share[part].mean()) for part in bins],
         "gain": [],
     }
-    if len(found) == 2:
-        later = found[1][1][seen] / size[seen]
+    if len(by_taps) == 2:
+        later = by_taps[1][1][seen] / size[seen]
         row["gain"] = [float(1 - later[part].sum() / share[part].sum()) for part in bins]
     return {name: [float(f"{value:.4g}") for value in values] for name, values in row.items()}
 

@@ -30,7 +30,7 @@ def harmless(text: str, kept: str = "\n\t") -> str:
     """
     if text.isprintable():
         return text
-    return "".join(one if one.isprintable() or one in kept else _escaped(one) for one in text)
+    return "".join(letter if letter.isprintable() or letter in kept else _escaped(letter) for letter in text)
 
 
 def _escaped(letter: str) -> str:
@@ -47,7 +47,7 @@ def as_typed(text: object) -> str:
     if name.isprintable():
         return quote(name)
     letters = re.sub(r"([\\'])", r"\\\1", name)
-    return f"$'{''.join(one if one.isprintable() else _typed_escape(one) for one in letters)}'"
+    return f"$'{''.join(letter if letter.isprintable() else _typed_escape(letter) for letter in letters)}'"
 
 
 def _typed_escape(letter: str) -> str:

@@ -63,5 +63,5 @@ MOST_TAXELS: Final = 64  # most taxels of a sensor: the bits of the masks in rec
 
 def pad_of(rows: int, cols: int) -> SensorGeometry:
     """Return the pad of PADS with this grid, or for a recording of another one a geometry without a pitch."""
-    known = next((pad for pad in PADS if (pad.rows, pad.cols) == (rows, cols)), None)
-    return known or SensorGeometry(f"unknown {rows}x{cols}", rows, cols, np.nan, np.nan, np.nan)
+    named = next((pad for pad in PADS if (pad.rows, pad.cols) == (rows, cols)), None)
+    return named or SensorGeometry(f"unknown {rows}x{cols}", rows, cols, np.nan, np.nan, np.nan)

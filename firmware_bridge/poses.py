@@ -57,7 +57,7 @@ class PadPose:
         )
 
 
-POSE_FIELDS: Final = tuple(one.name for one in fields(PadPose))
+POSE_FIELDS: Final = tuple(field.name for field in fields(PadPose))
 
 
 MOST_POSES: Final = 4096  # poses that are remembered: 40 s at 100 poses/s, longer than any tap lasts
@@ -132,14 +132,14 @@ class PoseTrack:
         if end_ns - start_ns > GAP_NS:
             return None
         share = (time_ns - start_ns) / (end_ns - start_ns)
-        one, other = self._poses[first][0], self._poses[second][0]
-        turned_deg = (other.turn_deg - one.turn_deg + 180) % 360 - 180  # the shorter way round
+        start, end = self._poses[first][0], self._poses[second][0]
+        turned_deg = (end.turn_deg - start.turn_deg + 180) % 360 - 180  # the shorter way round
         return PadPose(
-            one.x_mm + share * (other.x_mm - one.x_mm),
-            one.y_mm + share * (other.y_mm - one.y_mm),
-            one.turn_deg + share * turned_deg,
-            max(one.error_mm, other.error_mm),
-            max(one.error_deg, other.error_deg),
+            start.x_mm + share * (end.x_mm - start.x_mm),
+            start.y_mm + share * (end.y_mm - start.y_mm),
+            start.turn_deg + share * turned_deg,
+            max(start.error_mm, end.error_mm),
+            max(start.error_deg, end.error_deg),
         )
 
 

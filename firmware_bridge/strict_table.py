@@ -20,7 +20,7 @@ class Table:
         """
         self._path, self._name, self._error, self._remedy = path, name, error, remedy
         self._values = dict(values)
-        self._known: list[str] = []
+        self._taken: list[str] = []
 
     def part(self, key: str, values: Mapping[str, Any]) -> "Table":
         """Return a table in this one."""
@@ -28,7 +28,7 @@ class Table:
 
     def take(self, key: str, read: Callable[[Any], Any], *, required: bool = True) -> Any:
         """Return the value of a key, None if an optional one is missing; errors of `read` state what it expected."""
-        self._known.append(key)
+        self._taken.append(key)
         if key not in self._values:
             return self.refuse(key, "missing", "it to be there") if required else None
         value = self._values.pop(key)
@@ -40,7 +40,7 @@ class Table:
     def end(self) -> None:
         """Refuse keys that were not taken."""
         for key in self._values:
-            self.refuse(key, "not known", f"one of {', '.join(self._known)}")
+            self.refuse(key, "not known", f"one of {', '.join(self._taken)}")
 
     def refuse(self, key: str, got: str, expected: str) -> NoReturn:
         """Raise the error of a key, with its value, the expected one and the remedy."""
@@ -76,8 +76,8 @@ whole: Final = reader(lambda value: type(value) is int and 1 <= value < 2**31, "
 
 def one_of(*values: str | int) -> Callable[[Any], Any]:
     """Return a reader that accepts one of these values, of its type."""
-    known = [(type(one), one) for one in values]
-    return reader(lambda value: (type(value), value) in known, " or ".join(map(repr, values)))
+    allowed = [(type(value), value) for value in values]
+    return reader(lambda value: (type(value), value) in allowed, " or ".join(map(repr, values)))
 
 
 def between(low: float, high: float) -> Callable[[Any], Any]:
@@ -97,10 +97,10 @@ def cells(shape: tuple[int, ...], right: Callable[[list[Any]], bool], expected: 
         return value if len(shape) == 1 else [cell for part in value for cell in flat(part, shape[1:])]
 
     def read(value: Any) -> tuple[Any, ...]:
-        found = flat(value, shape)
-        if not right(found):
+        flat_cells = flat(value, shape)
+        if not right(flat_cells):
             raise ValueError(expected)
-        return tuple(found)
+        return tuple(flat_cells)
 
     return read
 
@@ -109,7 +109,7 @@ def numbers(
     shape: tuple[int, ...], expected: str, low: float = -LARGEST, high: float = LARGEST
 ) -> Callable[[Any], tuple[float, ...]]:
     """Return a reader of nested lists of numbers in a range, both ends included."""
-    read = cells(shape, lambda found: all(is_number(cell, low, high) for cell in found), expected)
+    read = cells(shape, lambda flat_cells: all(is_number(cell, low, high) for cell in flat_cells), expected)
     return lambda value: tuple(map(float, read(value)))
 
 

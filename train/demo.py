@@ -212,7 +212,7 @@ def _pressed(
 
     counts = np.zeros((len(place), *USPA44.scan_shape), dtype=np.float32)
     for start in range(0, len(place), _AT_ONCE):
-        heights = np.stack([under(*one) for one in place[start : start + _AT_ONCE]])
+        heights = np.stack([under(*pose) for pose in place[start : start + _AT_ONCE]])
         meets = np.flatnonzero((heights > -FIGURE_HEIGHT_MM / 2).any(axis=(1, 2)))
         if len(meets):
             turn = np.radians(place[start + meets, 2])

@@ -53,7 +53,8 @@ def given_taps(taps: int) -> tuple[float, ...]:
 
 def bundled(data: PressSet) -> tuple[Training, ...]:
     """Return the trainings of the bundled networks; DatasetError if no sequence has as many taps as they take."""
-    most, needed = int(data.counts.any(axis=(2, 3, 4)).sum(axis=1).max()), max(len(one.recipe.given) for one in BUNDLED)
+    most = int(data.counts.any(axis=(2, 3, 4)).sum(axis=1).max())
+    needed = max(len(training.recipe.given) for training in BUNDLED)
     if most < needed:  # before hours of training of those that come first
         raise DatasetError(
             f"the presses have at most {most} taps, the bundled networks take {needed}: add data/taps7.npz, or train "
@@ -95,27 +96,30 @@ def _training(options: argparse.Namespace) -> Training:
     compact = options.network.startswith(_COMPACT)
     # A network of the paper must not overwrite a bundled one.
     name = options.network if compact else f"seed-{options.network}"
-    known, start, keep = _KNOWN if compact else {}, options.start_from, options.keep
-    return Training(name, options.network, recipe, start=start, seed=options.seed, options=known, keep=keep)
+    constants, start, keep = _KNOWN if compact else {}, options.start_from, options.keep
+    return Training(name, options.network, recipe, start=start, seed=options.seed, options=constants, keep=keep)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m train.fit", description=(__doc__ or "").splitlines()[0])
-    add, one = parser.add_argument, parser.add_argument_group("one network instead of the bundled ones").add_argument
+    alone = parser.add_argument_group("one network instead of the bundled ones").add_argument
+    add = parser.add_argument
     add("folder", type=Path, help="folder for the checkpoints")
     add("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
     add("--validation", type=Path, required=True, help="presses to calibrate on, not used for training")
-    one(
+    alone(
         "--network",
         choices=NETWORKS,
         metavar="NAME",
         help=", ".join(NETWORKS) + "; those of the paper are seed-NAME.pt",
     )
-    one("--start-from", metavar="NAME", help="checkpoint in the same folder, or bundled NAME.onnx, to start from")
-    one("--keep", type=float, default=0.0, metavar="SHARE", help="share of its weights in the final ones (default: 0)")
-    one("--steps", type=int, default=9000)
-    one("--bf16", action="store_true", help="multiply in bfloat16")
-    one("--seed", type=int, default=1)
+    alone("--start-from", metavar="NAME", help="checkpoint in the same folder, or bundled NAME.onnx, to start from")
+    alone(
+        "--keep", type=float, default=0.0, metavar="SHARE", help="share of its weights in the final ones (default: 0)"
+    )
+    alone("--steps", type=int, default=9000)
+    alone("--bf16", action="store_true", help="multiply in bfloat16")
+    alone("--seed", type=int, default=1)
     return parser
 
 

@@ -73,16 +73,16 @@ def freeze(
     pad, numbers = GrippedPad(NOMINAL), tracked(range(len(names)), "tapping", "sequence")
     solved = [tap(pad, [names[at]] * taps, poses[at * taps : (at + 1) * taps], _PRESSED_TO_N) for at in numbers]
     true_poses = np.array(poses).reshape(-1, taps, 3)
-    end_n = np.stack([one.force_n[:, -1] for one in solved])
-    end_mm = np.stack([one.indentation_mm[0, -1] for one in solved])
+    end_n = np.stack([sequence.force_n[:, -1] for sequence in solved])
+    end_mm = np.stack([sequence.indentation_mm[0, -1] for sequence in solved])
 
     share = np.minimum(np.float64(TEST_FORCE_N) / end_n, 1.0)
     course = np.arange(1, FIRST_FRAME + FRAMES + 1) / (FIRST_FRAME + FRAMES)
-    clean = between_frames(np.concatenate([one.counts for one in solved]), share.reshape(-1, 1) * course)
+    clean = between_frames(np.concatenate([sequence.counts for sequence in solved]), share.reshape(-1, 1) * course)
     presses = clean.reshape(*share.shape, *clean.shape[1:])
     readings = apply_nuisances(presses, Nuisances(), SEED, angle_deg=true_poses[..., 2])
     moments = share[:, :1] * course[FIRST_FRAME:]
-    unit_patterns = np.stack([one.unit_patterns[0] for one in solved])
+    unit_patterns = np.stack([sequence.unit_patterns[0] for sequence in solved])
     return FrozenSet(
         newest=readings[:, 0, FIRST_FRAME:].reshape(-1, *readings.shape[3:]).astype(np.int16),
         earlier=readings[:, 1:, -1].astype(np.int16),
@@ -90,7 +90,7 @@ def freeze(
         indentation_mm=(end_mm[:, None] * moments).ravel().astype(np.float32),
         force_n=(end_n[:, :1] * moments).ravel().astype(np.float32),
         unit_patterns=resample(unit_patterns, FINE_SCALE, scale).astype(np.float16),
-        touched=resample_touching(np.stack([one.touching[0] for one in solved]), FINE_SCALE, scale),
+        touched=resample_touching(np.stack([sequence.touching[0] for sequence in solved]), FINE_SCALE, scale),
         surface=np.array(names),
         angle_deg=true_poses[:, 0, 2].astype(np.float32),
         full_scale_mm=MAX_INDENTATION_MM,
@@ -130,9 +130,9 @@ def fit_kinds(readings: NDArray[np.floating], kinds: int = KINDS) -> NDArray[np.
     for _ in range(10):
         for kind, share in enumerate(weight.T):
             covariances[kind] = (flat * share[:, None]).T @ flat / share.sum()
-        found = Kinds(ridged(covariances))
+        fitted = Kinds(ridged(covariances))
         # In parts, to use less than a gigabyte.
-        weight = np.concatenate([found.weigh(part) for part in np.array_split(flat, 40)])
+        weight = np.concatenate([fitted.weigh(part) for part in np.array_split(flat, 40)])
     return covariances.astype(np.float32)
 
 

@@ -60,9 +60,9 @@ def tapped(paths: Sequence[Path], surfaces: Sequence[Surface], knowledge: Knowle
         taps = recorded_taps(path, entry, knowledge.name)
         if taps[0].image is not None:
             under = [
-                (image_surface(one.image, _IMAGE_MM / len(one.image)), one.pose)
-                for one in taps
-                if one.image is not None
+                (image_surface(tap.image, _IMAGE_MM / len(tap.image)), tap.pose)
+                for tap in taps
+                if tap.image is not None
             ]
             places += [(number, tap) for tap in range(len(taps))]
             say(f"{path}: {len(taps)} published taps")
@@ -70,10 +70,10 @@ def tapped(paths: Sequence[Path], surfaces: Sequence[Surface], knowledge: Knowle
             if len(surfaces) not in (1, len(paths)):
                 raise DatasetError(f"{path}: on what? pass --surface once for all recordings, or once for each")
             surface = surfaces[number % len(surfaces)]
-            even = [replace(one, counts=one.counts / gains) for one in taps]
+            even = [replace(tap, counts=tap.counts / gains) for tap in taps]
             where = placed(even, surface, gripped)
-            under = [(surface, where(one.pose)) for one in taps]
-            places += [(number, round(one.pose.x_mm, 1), round(one.pose.y_mm, 1)) for one in taps]
+            under = [(surface, where(tap.pose)) for tap in taps]
+            places += [(number, round(tap.pose.x_mm, 1), round(tap.pose.y_mm, 1)) for tap in taps]
             say(f"{path}: {len(taps)} taps; {where.told()}")
         for tap, (surface, pose) in zip(tracked(taps, "what they touch", "tap"), under, strict=True):
             parts.append(_frames(tap, surface, pose, gripped, gains, path.stem))

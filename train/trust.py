@@ -97,7 +97,7 @@ def fit_forward_model(presses: PressSet) -> ForwardModel:
     z = clean.reshape(len(clean), len(AXES), -1)[:, AXES.index("z")]
     size = np.sqrt((z**2).mean(axis=1))[:, None] + QUIET_UNITS
     maps = zip(presses.patterns.astype(np.float32), presses.traction_kpa.astype(np.float32), strict=True)
-    inputs = condensed(np.stack([features(*one) for one in maps])) / size
+    inputs = condensed(np.stack([features(pattern, traction) for pattern, traction in maps])) / size
     constants = presses.constants.astype(np.float64)
     columns = np.concatenate([inputs, *(inputs * constants[:, [number]] for number in range(len(INPUTS)))], axis=1)
     normal = columns.T @ columns
@@ -110,8 +110,8 @@ def fit_forward_model(presses: PressSet) -> ForwardModel:
     field = usual.earth_field_counts * math.sqrt(2 / 3)
     noise = np.sqrt(drift**2 + field**2 + usual.noise_counts**2) / unit
     model_error = np.sqrt(np.mean(left**2, axis=(0, 2)))
-    found = ForwardModel(operator.astype(np.float32), noise.astype(np.float32), model_error.astype(np.float32))
-    return forward_model(found.to_json(), len(INPUTS))  # as the contract holds it
+    fitted = ForwardModel(operator.astype(np.float32), noise.astype(np.float32), model_error.astype(np.float32))
+    return forward_model(fitted.to_json(), len(INPUTS))  # as the contract holds it
 
 
 def main(arguments: list[str] | None = None) -> None:

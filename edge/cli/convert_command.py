@@ -21,7 +21,7 @@ from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import SensorEntry
 
 _NOT_IN_NPZ: Final = [
-    one.name for one in FIELDS if Out.RECORD in one.out and Out.NPZ not in one.out and one.name != "pose"
+    field.name for field in FIELDS if Out.RECORD in field.out and Out.NPZ not in field.out and field.name != "pose"
 ]
 _WITHOUT: Final = {
     (".mcap", ".npz"): f"events, counters, the wall clock, and of each record {', '.join(_NOT_IN_NPZ)}",
@@ -104,9 +104,9 @@ def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
 
     recording = replay.recordings[0]
     kind = recording.origin or "replay"
-    known = sensor_settings(None, unmapped(recording.tracks[0].geometry))
+    sensor_file = sensor_settings(None, unmapped(recording.tracks[0].geometry))
     entries = {name: SensorEntry(mounting) for name, mounting in recording.mountings.items()}
-    to = McapScans(path, replace(known, sensors=entries), 0)  # the time of recording is unknown
+    to = McapScans(path, replace(sensor_file, sensors=entries), 0)  # the time of recording is unknown
     try:
         with progress("convert", sum(len(track.counts) for track in recording.tracks), "scan") as bar:
             while not replay.ended:

@@ -155,8 +155,8 @@ class DemoScore:
 
     def truth(self, result: Result) -> NDArray[np.float32] | None:
         """Return the true pattern (H, W) in [mm] of a scan of the figure; None of any other."""
-        known = self._recording.taps.get(_key(result.scan.counts))
-        return None if known is None else self._true_pattern(*known)
+        press = self._recording.taps.get(_key(result.scan.counts))
+        return None if press is None else self._true_pattern(*press)
 
     def _true_pattern(self, tap: int, indentation_mm: float) -> NDArray[np.float32]:
         whose, row = self._recording.place_of(tap)
@@ -170,7 +170,7 @@ class DemoScore:
         x_mm, y_mm, turn_deg = self._recording.arrays[f"{whose or 'tap_'}pose"][row, :3].tolist()
         alone = result.pattern if result.taps_used < 2 else self._alone(result)
         error_db = float(psnr_db(result.pattern, truth, full_scale))
-        errors = (float(rmse_percent(one, truth, full_scale)) for one in (result.pattern, alone))
+        errors = (float(rmse_percent(pattern, truth, full_scale)) for pattern in (result.pattern, alone))
         return TapScore(number, (x_mm, y_mm, turn_deg), result, truth, error_db, *errors)
 
     def _alone(self, result: Result) -> NDArray[np.float32]:
@@ -268,7 +268,7 @@ class DemoMap(MapSink):
         away_mm = float(boundary_distance_mm(contact[None], self._letter[None], 0.5, 1 / px_per_mm)[0])
         rows, cols = (np.flatnonzero(self._letter.any(axis=axis)) for axis in (1, 0))
         margin = round(1.0 * px_per_mm)  # of 1 mm
-        shown = tuple(slice(max(0, one[0] - margin), one[-1] + 1 + margin) for one in (rows, cols))
+        shown = tuple(slice(max(0, lines[0] - margin), lines[-1] + 1 + margin) for lines in (rows, cols))
         length_mm = (cols[-1] + 1 - cols[0]) / px_per_mm
         title = f"map of a letter of {length_mm:.0f} mm, from one slide: {self.whole.fused} patterns fused, "
         panels = [

@@ -34,9 +34,9 @@ def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     if not paths:
         raise ModelError("no models are bundled with this installation")
     models = [load_model(path) for path in paths]
-    measure, took_us = options.measure, run_times_us(models) if options.measure else []
+    took_us = run_times_us(models) if options.measure else []
     widest = max(len(path.stem) for path in paths)
-    times = " p50 us p99 us" if measure else ""
+    times = " p50 us p99 us" if took_us else ""
     shown = {"psnr_db": "7.1f", "rmse_percent": "6.2f", "boundary_mm": "7.2f"}
     out.write(f"{'model':{widest}s} taps   MB arithmetic PSNR dB RMSE % edge mm{times}\n")
     for index, (path, model) in enumerate(zip(paths, models, strict=True)):
@@ -46,11 +46,11 @@ def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
             f" {error[name]:{width}}" if name in error else f" {'-':>{width[0]}s}" for name, width in shown.items()
         )
         cells = f"{path.stem:{widest}s} {contract.taps:4d} {path.stat().st_size / 1e6:4.1f} {contract.arithmetic:10s}"
-        times = "".join(f" {us:6.0f}" for us in took_us[index]) if measure else ""
+        times = "".join(f" {us:6.0f}" for us in took_us[index]) if took_us else ""
         default = {DEFAULT_MODEL: " default", POSED_MODEL: " with poses"}.get(path.stem, "")
         out.write(f"{cells}{figures}{times}{default}\n")
     out.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
-    if not measure:
+    if not took_us:
         return
     out.write(f"run times of {ROUNDS * TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
     # The ratio is 1.2 to 1.4 on a quiet machine.
@@ -85,24 +85,24 @@ def show_devices(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 
     Raises DeviceError if no adapter is among them.
     """
-    found, notes = devices()
+    listed, notes = devices()
     if options.json:
-        out.write(json.dumps({"devices": [one._asdict() for one in found], "notes": notes}, indent=1) + "\n")
+        out.write(json.dumps({"devices": [device._asdict() for device in listed], "notes": notes}, indent=1) + "\n")
     else:
-        out.write("".join(f"{line}\n" for line in page(found, notes, columns())))
-    if not any(one.adapter for one in found):
+        out.write("".join(f"{line}\n" for line in page(listed, notes, columns())))
+    if not any(device.adapter for device in listed):
         raise DeviceError(NOTHING)
 
 
-def page(found: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
+def page(listed: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
     """Return lines for a reader, adapters first; only text to be typed and longer words are wider than `width`."""
     lines: list[str] = []
-    for one in sorted(found, key=lambda one: not one.adapter):
-        serial = f"serial {one.serial_number}" if one.serial_number else None
-        lines += wrapped("  ".join(word for word in (one.path, one.usb_id, serial) if word), width, indent="  ")
-        lines += wrapped(f"{'looks like ' if one.adapter else ''}{one.looks_like}", width, "  ", "  ")
-        lines.append(f"  --source {as_typed(one.source)}")
-        for problem in one.problems:
+    for device in sorted(listed, key=lambda device: not device.adapter):
+        serial = f"serial {device.serial_number}" if device.serial_number else None
+        lines += wrapped("  ".join(word for word in (device.path, device.usb_id, serial) if word), width, indent="  ")
+        lines += wrapped(f"{'looks like ' if device.adapter else ''}{device.looks_like}", width, "  ", "  ")
+        lines.append(f"  --source {as_typed(device.source)}")
+        for problem in device.problems:
             lines += wrapped(problem, width, "  ! ", "    ")
     for note in (*notes, SERVER_HINT):
         lines += wrapped(note, width)

@@ -106,13 +106,13 @@ def parser(command: str = "", *, usual: bool = False) -> argparse.ArgumentParser
     if not command:
         made.add_argument("-h", "--help", action="help", help="show all options; -h shows the usual ones")
     for listed in help_.groups:
-        shown = [one for one in listed.options if not usual or (isinstance(one, Option) and one.name in _USUAL)]
+        shown = [row for row in listed.options if not usual or (isinstance(row, Option) and row.name in _USUAL)]
         if not shown:
             continue
         group = made if listed.title is None else made.add_argument_group(listed.title, listed.about)
-        for one in shown:
-            to = group.add_mutually_exclusive_group() if isinstance(one, tuple) else group
-            for option in one if isinstance(one, tuple) else (one,):
+        for row in shown:
+            to = group.add_mutually_exclusive_group() if isinstance(row, tuple) else group
+            for option in row if isinstance(row, tuple) else (row,):
                 to.add_argument(option.name, **option.settings)
     made.set_defaults(**_FIXED.get(command, {}))
     return made

@@ -39,8 +39,8 @@ class Group:
 
     def __init__(self, title: str | None, *options: Option | tuple[Option, ...], about: str | None = None) -> None:
         self.title, self.options, self.about = title, options, about
-        named = (one for one in options if isinstance(one, Option) and not one.name.startswith("-"))
-        self.arguments = [one.settings["metavar"] + "..." * ("nargs" in one.settings) for one in named]
+        named = (option for option in options if isinstance(option, Option) and not option.name.startswith("-"))
+        self.arguments = [argument.settings["metavar"] + "..." * ("nargs" in argument.settings) for argument in named]
 
 
 # fmt: off

@@ -107,19 +107,19 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     if len(options.source) == 1 and options.source[0].startswith("replay:") and options.skip is options.scans is None:
         from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
 
-        kind, known = "replay", sensor_settings(options.sensor, options.id_map)
+        kind, sensor_file = "replay", sensor_settings(options.sensor, options.id_map)
         played = options.source[0].removeprefix("replay:")
-        baselines, notes = recorded_baselines(played, known, options.rate_hz, force=options.force)
+        baselines, notes = recorded_baselines(played, sensor_file, options.rate_hz, force=options.force)
         print("\n".join(notes), file=err)
     else:
         with stop_on_signals() as stop, _source(options, give_up_s=0) as source:
-            kind, known = source.kind, source.sensor_file
+            kind, sensor_file = source.kind, source.sensor_file
             asked = {name: value for name in ("scans", "skip") if (value := getattr(options, name)) is not None}
             baselines = take_baselines(source, **asked, stop=stop)
-    save_baselines(options.out, baselines.values(), known.orders)
-    for name, one in sorted(baselines.items()):
+    save_baselines(options.out, baselines.values(), sensor_file.orders)
+    for name, stored in sorted(baselines.items()):
         emulated = "" if kind == "device" else f" ({kind.upper()})"
-        print(f"sensor {name}: baseline {one.id} of {one.scans} scans{emulated} -> {options.out}", file=out)
+        print(f"sensor {name}: baseline {stored.id} of {stored.scans} scans{emulated} -> {options.out}", file=out)
     if replaced:
         print(f"the former file is now {options.out}{BACKUP_SUFFIX}", file=out)
 
@@ -201,8 +201,8 @@ def run(
         if stop.is_set():
             return
         find_model(name)  # first, or a name with a slip would wait for links that are slow to open
-        with ThreadPoolExecutor(1) as apart:
-            opening = apart.submit(source.open)  # its links open while the model loads
+        with ThreadPoolExecutor(1) as executor:
+            opening = executor.submit(source.open)  # its links open while the model loads
             model = load_model(name, stop=stop)
         with (
             _open_view(options, model.contract, commands) as view,
@@ -312,5 +312,5 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
 
 def _with_status(sinks: Sequence[str], source: Source) -> list[str]:
     """The sinks asked for, and on a terminal the live line; not where records may go there, or it is over at once."""
-    apart = source.patient or sys.stderr is None or not sys.stderr.isatty()
-    return list(sinks) if apart or {"status", "jsonl:-"} & set(sinks) else [*sinks, "status"]
+    live = sys.stderr is not None and sys.stderr.isatty() and not source.patient
+    return [*sinks, "status"] if live and not {"status", "jsonl:-"} & set(sinks) else list(sinks)

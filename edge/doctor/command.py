@@ -72,7 +72,7 @@ class Visit:
         self,
         options: argparse.Namespace,
         reader: LinkReader,
-        known: SensorFile,
+        sensor_file: SensorFile,
         err: TextIO,
         stop: threading.Event,
         rehearsal: Rehearsal | None,
@@ -81,7 +81,7 @@ class Visit:
         self.mountings: dict[str, Mounting] = {}
         self.weighed: dict[str, Weighed] = {}
         self.unfinished = False
-        self._options, self._reader, self._known = options, reader, known
+        self._options, self._reader, self._sensor_file = options, reader, sensor_file
         self._link = reader.link
         self._err, self._stop, self._rehearsal = err, stop, rehearsal
         self._rewritable = rewritable(err)
@@ -112,22 +112,22 @@ class Visit:
             self._grip((names[0], names[1]), examined)
 
     def _press_one(self, name: str, whose: str, examined: Examined) -> None:
-        geometry, answers = self._known.geometry, self._rehearsal is not None or _stdin_is_terminal()
+        geometry, answers = self._sensor_file.geometry, self._rehearsal is not None or _stdin_is_terminal()
         guide = GuidedPress(geometry, weigh=answers, z_noise_counts=examined.z_noise_counts[name])
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
         self._lead(guide, name, examined, whose)
-        findings, found = judge_press(guide.presses, geometry, kept=self._options.out is not None)
+        findings, mounting = judge_press(guide.presses, geometry, kept=self._options.out is not None)
         if guide.weight_g is not None:
             findings.append(judge_force(guide.weighed, kept=self._options.out is not None))
         self.unfinished |= any(finding.verdict == "not known" for finding in findings)
-        if answers and guide.weight_g is None and name not in self._known.counts_per_newton:
+        if answers and guide.weight_g is None and name not in self._sensor_file.counts_per_newton:
             remedy = "forces in newtons are a quarter off either way until a weight is laid on: run the doctor again"
             findings.append(Finding("force", "not known", "no weight was laid on", "", remedy))
         examined.findings.extend(replace(finding, sensor=name) for finding in findings)
         if guide.weighed is not None and guide.weighed.plausible:
             self.weighed[name] = guide.weighed
-        if found is not None:
-            self.mountings[name] = found
+        if mounting is not None:
+            self.mountings[name] = mounting
 
     def _grip(self, names: tuple[str, str], examined: Examined) -> None:
         """Ask for a grip of two pads, in which each is the other's reference."""
@@ -139,21 +139,21 @@ class Visit:
         while not (grip.over or self._stop.is_set() or self._link.ended or time.monotonic() > end_s):
             for scan in self._reader.read(POLL_S):
                 if scan.sensor in names:
-                    mounting = self._known.mountings.get(scan.sensor)
+                    mounting = self._sensor_file.mountings.get(scan.sensor)
                     zeroed = deformation(scan.counts, examined.baselines[scan.sensor], mounting)
                     grip.push(scan.sensor, scan.time_ns / NS_PER_S, float(np.nansum(zeroed[2])))
             if typed_line() is not None:
                 return
-        known = {name: Weighed(value, PARTLY_ERROR) for name, value in self._known.counts_per_newton.items()}
-        for name, (low, high) in self._known.scale_intervals.items():
-            value = known[name].counts_per_newton
-            known[name] = Weighed(value, max(high - value, value - low) / value)
-        examined.findings.extend(grip.judge(known | self.weighed))
+        scales = {name: Weighed(value, PARTLY_ERROR) for name, value in self._sensor_file.counts_per_newton.items()}
+        for name, (low, high) in self._sensor_file.scale_intervals.items():
+            value = scales[name].counts_per_newton
+            scales[name] = Weighed(value, max(high - value, value - low) / value)
+        examined.findings.extend(grip.judge(scales | self.weighed))
         self.weighed.update(grip.weighed)
 
     def _lead(self, guide: GuidedPress, name: str, examined: Examined, whose: str) -> None:
         """Lead a person through a dialogue about one sensor."""
-        baseline, mounting, asked = examined.baselines[name], self._known.mountings.get(name), guide.first
+        baseline, mounting, asked = examined.baselines[name], self._sensor_file.mountings.get(name), guide.first
         if not (self._stop.is_set() or self._link.ended):
             self._ask(whose, guide.first)
         received_s = asked_s = time.monotonic()
@@ -168,7 +168,8 @@ class Visit:
                 if scan.sensor == name:
                     received_s = time.monotonic()
                     requests.append(guide.push(deformation(scan.counts, baseline, mounting), scan.time_ns / NS_PER_S))
-            if (line := self._typed_line()) is not None:
+            line = typed_line() if self._rehearsal is None else self._rehearsal.typed_line()
+            if line is not None:
                 requests.append(guide.type(line))
             for asked in filter(None, requests):
                 self._ask(whose, asked)
@@ -181,9 +182,6 @@ class Visit:
         self._say(whose + request)
         if self._rehearsal is not None:
             self._rehearsal.answer(request)
-
-    def _typed_line(self) -> str | None:
-        return typed_line() if self._rehearsal is None else self._rehearsal.typed_line()
 
     def _show_load(self, felt: float, left_s: float) -> None:
         """Show the load, as a share of that of a press, in a line that is rewritten in place."""
@@ -224,25 +222,25 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         forget_learned(options.sensor, options.forget_gains)
         print(f"{options.sensor}: learned gains of sensor {options.forget_gains} removed", file=out)
         return 0
-    known = sensor_settings(options.sensor, options.id_map)
+    sensor_file = sensor_settings(options.sensor, options.id_map)
     if options.out is not None:
-        check_writable(options.out, known)
-    before = stored_baselines(options.baseline, known)
-    if options.rehearse and (options.source or known.model_map.geometry != USPA44):
+        check_writable(options.out, sensor_file)
+    before = stored_baselines(options.baseline, sensor_file)
+    if options.rehearse and (options.source or sensor_file.model_map.geometry != USPA44):
         raise UsageError("--rehearse brings its own sensor, a uSPa44: leave --source and other pads out")
     with stop_on_signals() as stop, Rehearsal() if options.rehearse else nullcontext() as rehearsal:
         sources = options.source if rehearsal is None else [f"slcan:{rehearsal.port}"]
-        reader, known, watched = prepare(sources, known, before, options.rate_hz)
+        reader, sensor_file, watched = prepare(sources, sensor_file, before, options.rate_hz)
         link = reader.link
         emulated = "emulated" in (link.kind, link.origin)
         if options.out is not None and emulated:
-            refuse_device(options.out, known)
-        visit = Visit(options, reader, known, err, stop, rehearsal)
+            refuse_device(options.out, sensor_file)
+        visit = Visit(options, reader, sensor_file, err, stop, rehearsal)
         start_s = time.monotonic()
         failed: BridgeError | None = None
         whole = False
         with reader:
-            refuse_emulated(known, link.kind, link.origin, options.force)
+            refuse_emulated(sensor_file, link.kind, link.origin, options.force)
             try:
                 visit.watch(watched)
                 whole = not stop.is_set()
@@ -258,21 +256,23 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
             examined.findings.append(Finding("link", "wrong", f"lost: {failed}", "", "check plug and cable"))
         kept, replaced = False, options.out is not None and options.out.exists()
         if options.out is not None and failed is None and whole:
-            free = {name: one for name, one in examined.baselines.items() if name not in examined.loaded}
+            free = {name: baseline for name, baseline in examined.baselines.items() if name not in examined.loaded}
+            port = watched.facts.port
             try:
-                keep(options.out, known, watched.facts.port, free, visit.mountings, visit.weighed, emulated=emulated)
+                keep(options.out, sensor_file, port, free, visit.mountings, visit.weighed, emulated=emulated)
                 kept = True
             except SensorFileError as error:
                 failed = error
         stopped_s = time.monotonic() - start_s if stop.is_set() else None
+        verdict = worst(finding.verdict for finding in examined.findings)
         if options.json:
             document = {
                 "source": link.name,
                 "kind": link.kind,
-                "id_map": known.model,
+                "id_map": sensor_file.model,
                 "duration_s": round(watched.duration_s, 3),
                 "stopped": stopped_s is not None,
-                "verdict": worst(examined.findings),
+                "verdict": verdict,
                 "findings": [asdict(finding) for finding in examined.findings],
                 "sensor_file": str(options.out) if kept else None,
             }
@@ -293,31 +293,33 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
             if options.out is not None and not kept:
                 print(f"{options.out}: not written, because the free pad was not measured to the end", file=err)
             return 130
-    return 1 if visit.unfinished or worst(examined.findings) == "wrong" else 0
+    return 1 if visit.unfinished or verdict == "wrong" else 0
 
 
-def check_writable(path: Path, known: SensorFile) -> None:
+def check_writable(path: Path, sensor_file: SensorFile) -> None:
     """Check that a file may be written, before minutes are spent on its content.
 
-    It is a new one, or that of `known`, of which all is kept that is not measured again. Raises SensorFileError for
-    another, and for one that cannot be written.
+    It is a new one, or that of `sensor_file`, of which all is kept that is not measured again. Raises SensorFileError
+    for another, and for one that cannot be written.
     """
     try:
         in_place.check_writable(path)
     except OSError as error:
         why = error.strerror or error
         raise SensorFileError(f"{path}: cannot be written: {why}: pass --out a file in a folder of yours") from error
-    if path.exists() and (known.path is None or known.path.resolve() != path.resolve()):
+    if path.exists() and (sensor_file.path is None or sensor_file.path.resolve() != path.resolve()):
         raise SensorFileError(
             f"{path}: left as it is, because what it holds would be lost: pass --sensor {as_typed(path)} as well, to "
             "keep what is not measured again, or another --out"
         )
 
 
-def refuse_device(path: Path, known: SensorFile) -> None:
+def refuse_device(path: Path, sensor_file: SensorFile) -> None:
     """Raise a SensorFileError where an emulated sensor would be written into the file of a device."""
-    measured = (one for one in known.sensors.values() if one.baseline is not None or "mounting" not in one.assumed)
-    if path.exists() and not all(one.emulated for one in measured):
+    measured = (
+        entry for entry in sensor_file.sensors.values() if entry.baseline is not None or "mounting" not in entry.assumed
+    )
+    if path.exists() and not all(entry.emulated for entry in measured):
         raise SensorFileError(
             f"{path}: left as it is, because it is of a device, and this one is emulated: another --out"
         )
@@ -325,29 +327,29 @@ def refuse_device(path: Path, known: SensorFile) -> None:
 
 def keep(
     path: Path,
-    known: SensorFile,
+    sensor_file: SensorFile,
     port: str | None,
     baselines: Mapping[str, Baseline],
-    found: Mapping[str, Mounting],
+    mountings: Mapping[str, Mounting],
     weighed: Mapping[str, Weighed],
     *,
     emulated: bool = False,
 ) -> SensorFile:
-    """Write what is `known` from before and the new results, by sensor, into a sensor file, and return it.
+    """Write the `sensor_file` from before with the new results, by sensor, and return it as written.
 
     `port` is that of the adapter, whose serial number is kept where it has one; baselines are of the free pads as they
-    were read, and `found` are corrections of the mounting. Raises SensorFileError where the file cannot be written.
+    were read, and `mountings` are corrections of those before. Raises SensorFileError where it cannot be written.
     """
     with changing(path):
-        entries, as_wired = dict(known.sensors), Mounting(taxel_count=known.geometry.taxel_count)
+        entries, as_wired = dict(sensor_file.sensors), Mounting(taxel_count=sensor_file.geometry.taxel_count)
         if path.exists():  # a run may have learned gains meanwhile
             for name, entry in load_sensor_file(path).sensors.items():
                 entries[name] = replace(entries.get(name, entry), learned=entry.learned)
-        for name in sorted({*baselines, *found, *weighed}):
+        for name in sorted({*baselines, *mountings, *weighed}):
             entry = entries.get(name, SensorEntry(as_wired, assumed=frozenset({"mounting"})))
-            parts = {"mounting": found, "force": weighed, "baseline": baselines}
+            parts = {"mounting": mountings, "force": weighed, "baseline": baselines}
             renewed = frozenset(part for part, of_sensors in parts.items() if name in of_sensors)
-            turned = found.get(name, as_wired)
+            turned = mountings.get(name, as_wired)
             baseline = baselines.get(name, entry.baseline)
             if baseline is not None and turned.moves_taxels:
                 counts = baseline.counts.reshape(3, -1)[:, list(turned.order)].reshape(baseline.counts.shape)
@@ -370,12 +372,12 @@ def keep(
             )
         # A sensor of a named source is one of several, each with an adapter of its own.
         serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)
-        written = replace(known, adapter=serial_number or known.adapter, sensors=entries)
+        written = replace(sensor_file, adapter=serial_number or sensor_file.adapter, sensors=entries)
         save_sensor_file(path, written)
         return written
 
 
-def _serial_number(port: str) -> str | None:
-    device, ports = str(Path(port).resolve()), serial_ports()
-    number = next((one.serial_number for one in ports if one.path == device), None)
-    return number if [one.serial_number for one in ports].count(number) == 1 else None
+def _serial_number(path: str) -> str | None:
+    device, ports = str(Path(path).resolve()), serial_ports()
+    number = next((port.serial_number for port in ports if port.path == device), None)
+    return number if [port.serial_number for port in ports].count(number) == 1 else None

@@ -67,10 +67,10 @@ class Examined:
 
 def judge(watched: Watched, unix_time_s: float) -> Examined:
     """Return all findings of a watch; `unix_time_s` dates the baselines, in [s] since 1970, NaN if unknown."""
-    samples = {name: Samples(scans) for name, scans in sorted(watched.scans.items()) if len(scans) > 1}
+    sampled = {name: Samples(scans) for name, scans in sorted(watched.scans.items()) if len(scans) > 1}
     fewest = 50  # scans that are judged: of fewer neither noise nor rate is known well enough
-    enough = {name: one for name, one in samples.items() if one.scans >= fewest}
-    half_silent = {name for name, one in enough.items() if 2 * np.count_nonzero(one.living) <= one.living.size}
+    enough = {name: samples for name, samples in sampled.items() if samples.scans >= fewest}
+    half_silent = {name for name, samples in enough.items() if samples.living.mean() <= 0.5}
     facts, counters, duration_s = watched.facts, watched.counters, watched.duration_s
     taxel_count = watched.model.geometry.taxel_count
     baud = link_checks.check_baud(facts, counters, duration_s, len(enough), watched.rate_hz, taxel_count)
@@ -81,34 +81,34 @@ def judge(watched: Watched, unix_time_s: float) -> Examined:
     if not enough:
         link_faulty = any(finding.verdict == "wrong" for finding in findings)
         remedy = "see above" if link_faulty else "is the sensor powered, and is nothing else reading it?"
-        scans = f"{sum(one.scans for one in samples.values())} scans"
+        scans = f"{sum(samples.scans for samples in sampled.values())} scans"
         findings.append(Finding("scans", "wrong", scans, f"at least {fewest} of a sensor", remedy))
     wrong_map = id_map is not None and id_map.verdict == "wrong"
     last_ns = (scans[-1].time_ns for scans in watched.scans.values() if scans)
     newest_ns = watched.until_ns if watched.until_ns is not None else max(last_ns, default=0)
     baselines: dict[str, Baseline] = {}
-    for name, one in enough.items():
-        drift, noise = taxels.check_drift(one), taxels.check_noise(one)
+    for name, samples in enough.items():
+        drift, noise = taxels.check_drift(samples), taxels.check_noise(samples)
         spoiled = next((check.name for check in (noise, drift) if check.verdict != "ok"), None)
-        baseline, quality = check_baseline(watched.scans[name][1:], one.living, spoiled, unix_time_s)
+        baseline, quality = check_baseline(watched.scans[name][1:], samples.living, spoiled, unix_time_s)
         of_sensor = [
-            link_checks.check_rate(one, watched.rate_hz, line_full),
-            link_checks.check_torn(one),
-            link_checks.check_lost(one, (newest_ns - watched.scans[name][-1].time_ns) / NS_PER_S),
-            taxels.check_silent(one, wrong_map and name in half_silent),
-            taxels.check_stuck(one),
+            link_checks.check_rate(samples, watched.rate_hz, line_full),
+            link_checks.check_torn(samples),
+            link_checks.check_lost(samples, (newest_ns - watched.scans[name][-1].time_ns) / NS_PER_S),
+            taxels.check_silent(samples, wrong_map and name in half_silent),
+            taxels.check_stuck(samples),
             noise,
-            taxels.check_rest(one),
+            taxels.check_rest(samples),
             drift,
             quality,
-            check_load(one.rest_counts(), watched.references.get(name), watched.mountings.get(name)),
+            check_load(samples.rest_counts(), watched.references.get(name), watched.mountings.get(name)),
         ]
         if baseline is not None:
             baselines[name] = baseline
         findings += [replace(finding, sensor=name) for finding in of_sensor]
-    loaded = {one.sensor for one in findings if one.name == "load" and one.remedy == _PRESSED and one.sensor}
-    noise_counts = {name: one.z_sum_noise_counts() for name, one in enough.items()}
-    return Examined(findings, baselines, frozenset(loaded), noise_counts)
+    loaded = frozenset(finding.sensor for finding in findings if finding.remedy == _PRESSED and finding.sensor)
+    noise_counts = {name: samples.z_sum_noise_counts() for name, samples in enough.items()}
+    return Examined(findings, baselines, loaded, noise_counts)
 
 
 def check_baseline(
@@ -155,8 +155,8 @@ def check_load(
     if reference is None:
         remedy = "a pad that was loaded from the start looks free; pass an earlier --baseline or --sensor"
         return Finding("load", "not known", "no earlier baseline to compare with", norm, remedy)
-    known = np.nan_to_num(rest_counts).reshape(reference.counts.shape)
-    z = deformation(np.rint(known).astype(np.int32) % zeroing.COUNTS_ON_CIRCLE, reference, mounting)[2].ravel()
+    rest = np.nan_to_num(rest_counts).reshape(reference.counts.shape)
+    z = deformation(np.rint(rest).astype(np.int32) % zeroing.COUNTS_ON_CIRCLE, reference, mounting)[2].ravel()
     z[np.isnan(rest_counts[2])] = 0
     z = np.nan_to_num(z)
     taxel = int(np.abs(z).argmax())
@@ -166,7 +166,7 @@ def check_load(
 
 
 def prepare(
-    texts: Sequence[str], known: SensorFile, before: Mapping[str, Baseline], rate_hz: float | None
+    texts: Sequence[str], sensor_file: SensorFile, before: Mapping[str, Baseline], rate_hz: float | None
 ) -> tuple[LinkReader, SensorFile, Watched]:
     """Return a reader of the link to the source that `texts` names, the facts on its sensors, and an empty watch of it.
 
@@ -177,11 +177,11 @@ def prepare(
         raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
     if rate_hz is not None:
         check_positive("rate_hz", rate_hz)
-    check_baselines(before, known.model_map.geometry)
-    (link,) = links_to(texts, known, rate_hz=rate_hz)
-    known = with_recorded(known, [link])
-    watched = Watched(model=known.model_map, rate_hz=rate_hz, references=before, mountings=known.mountings)
-    return LinkReader(link), known, watched
+    check_baselines(before, sensor_file.model_map.geometry)
+    (link,) = links_to(texts, sensor_file, rate_hz=rate_hz)
+    sensor_file = with_recorded(sensor_file, [link])
+    watched = Watched(model=sensor_file.model_map, rate_hz=rate_hz, references=before, mountings=sensor_file.mountings)
+    return LinkReader(link), sensor_file, watched
 
 
 def watch(
@@ -231,9 +231,9 @@ def examine(
         UsageError: as for `open_source`; several sources, or baselines or a duration that are out of range.
     """
     check_positive("duration_s", duration_s)
-    known = sensor_settings(sensor, id_map)
-    reader, known, watched = prepare(texts, known, stored_baselines(baselines, known), rate_hz)
+    sensor_file = sensor_settings(sensor, id_map)
+    reader, sensor_file, watched = prepare(texts, sensor_file, stored_baselines(baselines, sensor_file), rate_hz)
     with reader:
-        refuse_emulated(known, reader.link.kind, reader.link.origin, force=False)
+        refuse_emulated(sensor_file, reader.link.kind, reader.link.origin, force=False)
         watch(reader, watched, duration_s, threading.Event() if stop is None else stop)
     return judge(watched, time.time()).findings

@@ -32,10 +32,10 @@ def graded(value: float, look: float, wrong: float) -> Verdict:
     return "ok" if value <= look else "look" if value <= wrong else "wrong"
 
 
-def worst(findings: Iterable[Finding]) -> Verdict:
+def worst(verdicts: Iterable[Verdict]) -> Verdict:
     """Return the gravest verdict; "not known" counts as ok."""
-    verdicts = {finding.verdict for finding in findings}
-    return "wrong" if "wrong" in verdicts else "look" if "look" in verdicts else "ok"
+    present = set(verdicts)
+    return "wrong" if "wrong" in present else "look" if "look" in present else "ok"
 
 
 def summary(findings: Iterable[Finding]) -> str:
@@ -54,7 +54,8 @@ def page(findings: Sequence[Finding], columns: int) -> str:
     indent = " " * 8
     for sensor in dict.fromkeys(finding.sensor for finding in findings):
         lines.append("link" if sensor is None else f"sensor {sensor}")
-        for finding in (one for one in findings if one.sensor == sensor):
+        of_sensor = [finding for finding in findings if finding.sensor == sensor]
+        for finding in of_sensor:
             norm = f" (norm: {finding.norm})" if finding.norm else ""
             text = f"{finding.name}: {finding.measured}{norm}"
             lines += wrapped(text, columns, f"  {marks[finding.verdict]:6}", indent)

@@ -76,7 +76,7 @@ class Grip:
             remedy = "each of them may read a quarter more or less: lay a weight on one, or on both"
             scale = Finding("scale in a grip", "not known", measured, "", remedy)
         findings.append(scale)
-        if any(one.verdict != "ok" for one in findings):  # a scale from here would look right
+        if any(finding.verdict != "ok" for finding in findings):  # a scale from here would look right
             return findings
         for name, partner, factor in ((second, first, 1 / ratio), (first, second, ratio)):
             if partner in weighed:

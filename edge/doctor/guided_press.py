@@ -38,14 +38,14 @@ def orders(geometry: SensorGeometry = USPA44) -> dict[str, tuple[int, ...]]:
     There are eight, and four where the pad is not square: a quarter turn would make another grid of it.
     """
     grid = np.arange(geometry.taxel_count).reshape(geometry.rows, geometry.cols)
-    found: dict[str, tuple[int, ...]] = {}
+    orientations: dict[str, tuple[int, ...]] = {}
     for mirrored in (False, True):
         for quarters in range(4) if geometry.rows == geometry.cols else (0, 2):
             turn = f"turned by {90 * quarters} degrees clockwise" if quarters else ""
             ways = ("mirrored left to right" if mirrored else "", turn)
             turned = np.rot90(np.fliplr(grid) if mirrored else grid, -quarters)
-            found[", then ".join(filter(None, ways)) or AS_MAPPED] = tuple(turned.ravel().tolist())
-    return found
+            orientations[", then ".join(filter(None, ways)) or AS_MAPPED] = tuple(turned.ravel().tolist())
+    return orientations
 
 
 def corner_taxel(z_counts: NDArray[np.floating]) -> int | None:
@@ -66,8 +66,10 @@ def corner_taxel(z_counts: NDArray[np.floating]) -> int | None:
 
 def find_order(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> str | None:
     """Return the name of the pad's orientation in `orders`; None where no orientation fits."""
-    fits = (name for name, order in orders(geometry).items() if all(order[one.place] == one.taxel for one in presses))
-    return next(fits, None)
+    for name, order in orders(geometry).items():
+        if all(order[press.place] == press.taxel for press in presses):
+            return name
+    return None
 
 
 def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> tuple[bool, tuple[int, int]] | None:
@@ -114,7 +116,7 @@ def judge_press(
     turn, axes, z = find_order(presses, geometry), find_axes(presses, geometry), z_sign(presses)
     norm = "each corner answers where it is pressed"
     if turn is None:
-        corners = ", ".join(f"{CORNERS[geometry.corners.index(one.place)]}: taxel {one.taxel}" for one in presses)
+        corners = ", ".join(f"{CORNERS[geometry.corners.index(press.place)]}: taxel {press.taxel}" for press in presses)
         other = "no turn of this pad has its corners so: run the doctor once more, or try another --id-map"
         order = Finding("taxel order", "wrong", corners, norm, other)
     else:
@@ -187,15 +189,14 @@ def judge_force(weighed: Weighed | None, *, kept: bool) -> Finding:
         remedy = (
             "no sensor reads so, and it is not kept: does the weight have the grams typed, and rest on the pad alone?"
         )
-        return Finding("force", "look", measured, norm, remedy)
-    if error > COVERED_ERROR:
+    elif error > COVERED_ERROR:
         remedy = "it bears on a part of the pad: lay it on something flat that covers all of it, and weigh both"
-        return Finding("force", "look", measured, norm, remedy)
-    if not low <= counts_per_newton <= high:
+    elif not low <= counts_per_newton <= high:
         remedy = "is the weight as heavy as was typed, and does it lie on the pad alone?"
-        return Finding("force", "look", measured, norm, remedy)
-    use = "" if kept else f"edge-sr --counts-per-newton {counts_per_newton:.0f}"
-    return Finding("force", "ok", measured, norm, use)
+    else:
+        use = "" if kept else f"edge-sr --counts-per-newton {counts_per_newton:.0f}"
+        return Finding("force", "ok", measured, norm, use)
+    return Finding("force", "look", measured, norm, remedy)
 
 
 FREE_SCANS: Final = 20
@@ -288,7 +289,7 @@ class GuidedPress:
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
     ask = f"Press the {name} corner with a finger, about as hard as a stiff doorbell, and hold it."
-    held = yield from _wait(ask, lambda one: _touched(one) and corner_taxel(one.zeroed[2]) is not None, 20)
+    held = yield from _wait(ask, lambda reading: _touched(reading) and corner_taxel(reading.zeroed[2]) is not None, 20)
     if held is None:
         return None
     mean = np.mean([reading.zeroed for reading in held], axis=0)
@@ -302,11 +303,11 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
         return _touched(reading) and bool(np.abs(_shear_counts(reading) - before).min() >= 300.0)
 
     felt = yield from _wait(
-        "Still pressing, push towards the middle of the pad.", lambda one: pushed(one) or _free(one), 10
+        "Still pressing, push towards the middle of the pad.", lambda reading: pushed(reading) or _free(reading), 10
     )
     push = None
     if felt is not None and pushed(felt[-1]):
-        x, y = np.mean([_shear_counts(one) for one in felt], axis=0) - before
+        x, y = np.mean([_shear_counts(reading) for reading in felt], axis=0) - before
         push = (float(x), float(y))
     yield from _wait("Good. Let go." if push else "No push was measured. Let go.", _free, FREE_SCANS)
     return Press(place, taxel, float(mean[2].sum()), push)

@@ -39,11 +39,11 @@ def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> F
         tries = " or ".join(f"--id-map {name}" for name in others)
         measured = f"the ids received are not {model.name}'s but those of {owners}"
         return Finding("id map", "wrong", measured, norm, tries)
-    known = [can_id for can_id in ids if can_id in model.taxels]
+    mapped = [can_id for can_id in ids if can_id in model.taxels]
     shown = ", ".join(f"0x{can_id:03x}" for can_id in sorted(ids)[:8]) + ", ..." * (len(ids) > 8)
-    measured = f"{len(ids)} ids received, {len(known)} of them {model.name}'s: {shown}"
+    measured = f"{len(ids)} ids received, {len(mapped)} of them {model.name}'s: {shown}"
     remedy = "no map has all of these ids: half of the sensor may be broken, or other devices share the bus"
-    return judged("id map", "wrong" if half_silent or not known else "ok", measured, norm, remedy)
+    return judged("id map", "wrong" if half_silent or not mapped else "ok", measured, norm, remedy)
 
 
 def _whole_sensors(ids: AbstractSet[int], model: ModelMap) -> list[str]:
@@ -148,11 +148,11 @@ def check_latency(facts: LineFacts) -> Finding | None:
 def _trouble(counters: Mapping[str, int]) -> Finding | None:
     """Check the other counters of an adapter, by words in their names."""
     words = ("overrun", "overflow", "error", "lost")
-    found = [f"{name} {n}" for name, n in counters.items() if n > 0 and any(word in name for word in words)]
-    if not found:
+    troubles = [f"{name} {n}" for name, n in counters.items() if n > 0 and any(word in name for word in words)]
+    if not troubles:
         return None
     remedy = "the adapter loses frames: check the termination of the bus, and end what else loads this machine"
-    return Finding("link", "look", ", ".join(found), "none", remedy)
+    return Finding("link", "look", ", ".join(troubles), "none", remedy)
 
 
 _LOSS_LIMITS: Final = (0.001, 0.01)

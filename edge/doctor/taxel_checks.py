@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.findings import Finding, graded, judged
+from edge.doctor.findings import Finding, graded, judged, worst
 from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.result import NOISE_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
@@ -151,8 +151,8 @@ def check_noise(samples: Samples) -> Finding:
     noise = np.where(samples.stuck(), np.nan, samples.noise_counts())
     if np.isnan(noise).all():
         return Finding("noise", "not known", "no taxel sends new readings")
-    verdicts = {graded(np.nanmax(one), *limits) for one, limits in zip(noise, NOISE_LIMITS_COUNTS, strict=True)}
-    verdict = "wrong" if "wrong" in verdicts else "look" if "look" in verdicts else "ok"
+    largest = np.nanmax(noise, axis=1)
+    verdict = worst(graded(most, *limits) for most, limits in zip(largest, NOISE_LIMITS_COUNTS, strict=True))
     limits = np.asarray(NOISE_LIMITS_COUNTS)[:, :1]
     axis, taxel = _farthest(noise / limits)
     medians = ", ".join(f"{name} {np.nanmedian(plane):.1f}" for name, plane in zip(AXES, noise, strict=True))
@@ -171,8 +171,8 @@ def check_rest(samples: Samples) -> Finding:
     if np.isnan(rest).all():
         return Finding("rest levels", "not known", "no taxel has arrived")
     spans = (f"{n} {np.nanmin(r):.0f} to {np.nanmax(r):.0f}" for n, r in zip(AXES, rest, strict=True))
-    apart = around_counts(rest - rest[:, np.flatnonzero(samples.living)[:1]])
-    stray = np.abs(around_counts(apart - np.nanmedian(apart, axis=1, keepdims=True)))
+    from_first = around_counts(rest - rest[:, np.flatnonzero(samples.living)[:1]])
+    stray = np.abs(around_counts(from_first - np.nanmedian(from_first, axis=1, keepdims=True)))
     axis, taxel = _farthest(stray)
     norm = f"alike within {STRAY_COUNTS:.0f} counts on an axis"
     measured = f"{', '.join(spans)} counts"

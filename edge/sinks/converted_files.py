@@ -59,7 +59,7 @@ def write_npz(
         columns = _Columns(path.parent, opened)
         for row in rows:
             columns.add(row)
-        texts = json.dumps({name: mounting_text(one) for name, one in mountings.items()})
+        texts = json.dumps({name: mounting_text(mounting) for name, mounting in mountings.items()})
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, value in (("format", NPZ_FORMAT), ("version", NPZ_VERSION), ("mountings", texts)):
                 _add(archive, name, np.asarray(value))
@@ -115,11 +115,11 @@ def _pose_arrays(poses: Sequence[TimedPose]) -> dict[str, NDArray[Any]]:
     if not poses:
         return {}
     return {
-        "pose_time_ns": np.array([one.time_ns for one in poses]),
-        "pose": np.array([astuple(one.pose) for one in poses], np.float64),
-        "pose_sensor": np.array([one.sensor or "" for one in poses]),
-        "pose_holds": np.array([one.holds for one in poses]),
-        "pose_used_from_ns": np.array([-1 if one.used_from_ns is None else one.used_from_ns for one in poses]),
+        "pose_time_ns": np.array([pose.time_ns for pose in poses]),
+        "pose": np.array([astuple(pose.pose) for pose in poses], np.float64),
+        "pose_sensor": np.array([pose.sensor or "" for pose in poses]),
+        "pose_holds": np.array([pose.holds for pose in poses]),
+        "pose_used_from_ns": np.array([-1 if pose.used_from_ns is None else pose.used_from_ns for pose in poses]),
     }
 
 
@@ -149,13 +149,14 @@ class _Rows:
     def rows(self) -> Iterator[dict[str, Any]]:
         try:
             with self._path.open("rb") as file:
-                for one in messages(file, self._topic_of):
-                    if isinstance(one, Metadata):
-                        self._taps = int(one.metadata.get("taps", "1")) if one.name == "contract" else self._taps
+                for message in messages(file, self._topic_of):
+                    if isinstance(message, Metadata):
+                        if message.name == "contract":
+                            self._taps = int(message.metadata.get("taps", "1"))
                         continue
-                    if one[0].kind.name == SCAN_NAME and self._row is not None:
+                    if message[0].kind.name == SCAN_NAME and self._row is not None:
                         yield self._row
-                    self._read(*one)
+                    self._read(*message)
         except DamageError:
             pass  # a note of `load_recording` states it
         except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -181,8 +182,8 @@ class _Rows:
             return
         elif topic.kind.name == RESULT.name:
             record = json.loads(topic.kind.decode(data)["record"])
-            known = (field for field in _OF_RECORDS if field.name != "poses" or record.get("poses") is not None)
-            self._row |= {field.name: _value(field, record, self._taps) for field in known}
+            fields = (field for field in _OF_RECORDS if field.name != "poses" or record.get("poses") is not None)
+            self._row |= {field.name: _value(field, record, self._taps) for field in fields}
         elif topic.name in _MAP_NAMES:
             self._row |= {topic.name: _map(topic, data), "has_pattern": True}
 
@@ -215,8 +216,8 @@ def _value(field: Field, record: Mapping[str, Any], taps: int) -> Any:
         poses[: len(value)] = value[:taps]
         return poses
     if field.parts:
-        known = [np.nan if one is None else one for one in _flat(value)]
-        return (known + [np.nan] * len(field.parts))[: len(field.parts)]
+        numbers = [np.nan if number is None else number for number in _flat(value)]
+        return (numbers + [np.nan] * len(field.parts))[: len(field.parts)]
     if value is None:
         return field.kind.unknown
     return sum(1 << int(taxel) for taxel in value) if field.name == "dead" else value
@@ -232,7 +233,7 @@ def _flat(value: Any) -> list[float | None]:
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list):
-        return [number for one in value for number in _flat(one)]
+        return [number for part in value for number in _flat(part)]
     return [value]
 
 

@@ -89,8 +89,8 @@ class Fan(Sink):
         self.unwritten = self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
         if self._clock_ns() >= self._look_ns:
             self._look_ns = self._clock_ns() + LOOK_NS
-            known, self._known_trouble = self._known_trouble, self._troubles()
-            for trouble in sorted(self._known_trouble - known):
+            before, self._known_trouble = self._known_trouble, self._troubles()
+            for trouble in sorted(self._known_trouble - before):
                 self._tell_all(trouble)
 
     def _troubles(self) -> set[str]:

@@ -41,11 +41,11 @@ class RerunSink(Sink):
         """Open a viewer, connect to one, or begin a file; a SinkError where Rerun is missing, too old, or fails."""
         try:
             rerun: Any = import_module("rerun")
-            found = version("rerun-sdk")
+            installed = version("rerun-sdk")
         except (ImportError, PackageNotFoundError) as error:
             raise SinkError(f"rerun: needs rerun-sdk: {how_to_install('rerun')}") from error
-        if tuple(map(int, found.split(".")[:2])) < (0, 24):
-            raise SinkError(f"rerun: rerun-sdk is {found}, expected 0.24 or later: {how_to_install('rerun')}")
+        if tuple(map(int, installed.split(".")[:2])) < (0, 24):
+            raise SinkError(f"rerun: rerun-sdk is {installed}, expected 0.24 or later: {how_to_install('rerun')}")
         self._rerun = rerun
         self._stream: Any = rerun.RecordingStream(f"tactile_edge_sr, {source.kind}")
         self._of_maps = {"meter": 1000.0, "depth_range": (0.0, contract.output_full_scale), "colormap": "viridis"}

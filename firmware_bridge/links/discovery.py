@@ -83,7 +83,7 @@ def serial_devices(
 ) -> list[Found]:
     """Describe the serial ports, in their order; `may_open` returns True if this user may read and write a path."""
     serials = [port.serial_number for port in ports]
-    found: list[Found] = []
+    listed: list[Found] = []
     for port in ports:
         words = " by ".join(word for word in (port.product or port.description, port.manufacturer) if word)
         alone = port.serial_number is not None and serials.count(port.serial_number) == 1
@@ -92,7 +92,7 @@ def serial_devices(
             problems.append(NO_PERMISSION)
         if held := holders(port.path):
             problems.append(f"held by {', '.join(held)}: end it first")
-        found.append(
+        listed.append(
             Found(
                 "serial",
                 port.path,
@@ -104,12 +104,12 @@ def serial_devices(
                 tuple(problems),
             )
         )
-    return found
+    return listed
 
 
 def can_interfaces(sys_root: Path = SYS_ROOT) -> list[Found]:
     """List the CAN interfaces of the kernel, by name."""
-    found: list[Found] = []
+    listed: list[Found] = []
     for network in can_networks(sys_root):
         name, driver = network.name, network.driver
         problems = [] if network.problem is None else [network.problem]
@@ -117,8 +117,8 @@ def can_interfaces(sys_root: Path = SYS_ROOT) -> list[Found]:
         if bitrate not in (None, 0, BITRATE_BIT_S):
             problems.append(f"runs at {bitrate} bit/s, the sensor at {BITRATE_BIT_S}")
         looks_like = f"CAN interface, {f'driver {driver}' if driver else 'virtual or of slcand'}"
-        found.append(Found("socketcan", name, None, None, looks_like, True, f"can:socketcan:{name}", tuple(problems)))
-    return found
+        listed.append(Found("socketcan", name, None, None, looks_like, True, f"can:socketcan:{name}", tuple(problems)))
+    return listed
 
 
 def _gs_usb_adapters() -> list[Found]:
@@ -128,15 +128,15 @@ def _gs_usb_adapters() -> list[Found]:
     return [
         Found(
             "gs_usb",
-            one.where,
-            _usb_id(one.usb_id),
-            one.serial_number,
-            one.product or "gs_usb adapter",
+            adapter.where,
+            _usb_id(adapter.usb_id),
+            adapter.serial_number,
+            adapter.product or "gs_usb adapter",
             True,
-            source_name(one, present) or "gs_usb",
-            () if one.serial_number or one.product else (f"no permission: {udev_rule(one.usb_id)}",),
+            source_name(adapter, present) or "gs_usb",
+            () if adapter.serial_number or adapter.product else (f"no permission: {udev_rule(adapter.usb_id)}",),
         )
-        for one in present
+        for adapter in present
     ]
 
 

@@ -84,7 +84,7 @@ class GsUsbLink(FrameLink):
         self.name = "gs_usb" if wanted is None else f"gs_usb:{wanted}"
         self.kind: SourceKind = "device"
         self._wanted = wanted
-        self._known: Recognised[GsUsbDevice] = Recognised()
+        self._recognised: Recognised[GsUsbDevice] = Recognised()
         self._backend = backend
         self._received_bytes = self._transfers = 0
         self._device: usb.core.Device | None = None
@@ -94,7 +94,7 @@ class GsUsbLink(FrameLink):
     def __enter__(self) -> Self:
         with self._counting:
             self._scans.begin_anew()
-        described, device = find_gs_usb(self._wanted, self._known, self._backend)
+        described, device = find_gs_usb(self._wanted, self._recognised, self._backend)
         try:
             self._claim(device)
             self._start(device)
@@ -192,39 +192,40 @@ class GsUsbLink(FrameLink):
 
 def gs_usb_devices(backend: IBackend | None = None) -> list[GsUsbDevice]:
     """List all gs_usb adapters of this machine, by bus and address; raises DeviceError if USB cannot be read."""
-    return [described for described, _ in _found(backend)]
+    return [described for described, _ in _adapters(backend)]
 
 
 def find_gs_usb(
-    wanted: str | None, known: Recognised[GsUsbDevice], backend: IBackend | None = None
+    wanted: str | None, recognised: Recognised[GsUsbDevice], backend: IBackend | None = None
 ) -> tuple[GsUsbDevice, usb.core.Device]:
-    """Return the adapter with a serial number or at a place such as "1-2.3", for None the only one; `known` learns it.
+    """Return the adapter with a serial number or at a place such as "1-2.3", for None the only one, and learn it.
 
-    The one that is known from an earlier opening is found again, unless a place is wanted. It raises NoDeviceError
+    The one that was `recognised` at an earlier opening is found again, unless a place is wanted. Raises NoDeviceError
     where there is no such adapter, or several, and DeviceError if USB cannot be read.
     """
-    found = _found(backend)
-    present = [described for described, _ in found]
+    adapters = _adapters(backend)
+    present = [described for described, _ in adapters]
     seen = f"gs_usb adapters seen: {'; '.join(map(str, present)) or 'none'}"
     # Bus and sockets, as the kernel names a USB device.
     placed = wanted is not None and re.fullmatch(r"[0-9]+-[0-9]+(\.[0-9]+)*", wanted) is not None
-    if known.device is not None and not placed:
-        wanted, same = known.device.serial_number, known.find(present)
-        fitting = [one for one in present if one is same]
+    if recognised.device is not None and not placed:
+        wanted, same = recognised.device.serial_number, recognised.find(present)
+        fitting = [adapter for adapter in present if adapter is same]
     else:
-        fitting = [one for one in present if wanted in (None, one.place if placed else one.serial_number)]
+        named = [adapter.place if placed else adapter.serial_number for adapter in present]
+        fitting = [adapter for adapter, name in zip(present, named, strict=True) if wanted in (None, name)]
     if len(fitting) == 1:
-        known.learn(fitting[0], present)
-        return found[present.index(fitting[0])]
+        recognised.learn(fitting[0], present)
+        return adapters[present.index(fitting[0])]
     which = "" if wanted is None else f" at {wanted}" if placed else f" with serial number {wanted}"
     what = f"no gs_usb adapter{which}: plug it in, or name another source"
     if len(fitting) > 1:
-        named = next((name for one in present if (name := source_name(one, present))), "gs_usb:SERIAL")
+        named = next((name for adapter in present if (name := source_name(adapter, present))), "gs_usb:SERIAL")
         what = f"{len(fitting)} gs_usb adapters{which}: name one, such as --source {as_typed(named)}"
-    elif known.device is not None and wanted in [one.serial_number for one in present]:
-        what = f"no gs_usb adapter{which} that is surely the one: plug it in where it was, at {known.device.place}"
+    elif recognised.device is not None and wanted in [adapter.serial_number for adapter in present]:
+        what = f"no gs_usb adapter{which} that is surely the one: plug it in where it was, at {recognised.device.place}"
     named_by_serial = wanted is not None and not placed
-    unread = [one.usb_id for one in present if named_by_serial and one.serial_number is None]
+    unread = [adapter.usb_id for adapter in present if named_by_serial and adapter.serial_number is None]
     hint = f"; a serial number that is not shown could not be read: {udev_rule(unread[0])}" if unread else ""
     raise NoDeviceError(f"{what}. {seen}{hint}")
 
@@ -234,7 +235,8 @@ def source_name(device: GsUsbDevice, present: Sequence[GsUsbDevice]) -> str | No
 
     None where it has neither.
     """
-    own = device.serial_number is not None and [one.serial_number for one in present].count(device.serial_number) == 1
+    serial_numbers = [adapter.serial_number for adapter in present]
+    own = device.serial_number is not None and serial_numbers.count(device.serial_number) == 1
     name = device.serial_number if own else device.place
     return name and f"gs_usb:{name}"
 
@@ -270,7 +272,7 @@ def _reason(error: Exception, described: GsUsbDevice) -> str:
     return f"cannot be used as a gs_usb adapter: {error} ({described})"
 
 
-def _found(backend: IBackend | None) -> Sequence[tuple[GsUsbDevice, usb.core.Device]]:
+def _adapters(backend: IBackend | None) -> Sequence[tuple[GsUsbDevice, usb.core.Device]]:
     if backend is None:  # that of the package libusb-package, else the system's
         try:
             from libusb_package import get_libusb1_backend
@@ -280,11 +282,11 @@ def _found(backend: IBackend | None) -> Sequence[tuple[GsUsbDevice, usb.core.Dev
     if backend is None:
         raise DeviceError("libusb cannot be loaded: pip install libusb-package, or apt install libusb-1.0-0")
     try:
-        found = list(usb.core.find(find_all=True, backend=backend) or ())
+        seen = list(usb.core.find(find_all=True, backend=backend) or ())
     except (usb.core.USBError, NotImplementedError) as error:
         raise DeviceError(f"USB cannot be read: {error}") from error
-    devices = [device for device in found if isinstance(device, usb.core.Device) and _usb_id(device) in GS_USB_ADAPTERS]
-    return sorted(((_describe(device), device) for device in devices), key=lambda one: one[0][:2])
+    devices = [device for device in seen if isinstance(device, usb.core.Device) and _usb_id(device) in GS_USB_ADAPTERS]
+    return sorted(((_describe(device), device) for device in devices), key=lambda pair: pair[0][:2])
 
 
 def _usb_id(device: usb.core.Device) -> tuple[int, int]:

@@ -57,8 +57,8 @@ def open_sources(
         name, form = (match[1], match[2]) if match else (f"source{number}" if len(texts) > 1 else "", text)
         prefix = f"{name}/" if name else ""
         own = {
-            sensor: one
-            for sensor, one in mountings.items()
+            sensor: mounting
+            for sensor, mounting in mountings.items()
             if (sensor.startswith(prefix) if prefix else "/" not in sensor)
         }
         link = open_source(form, rate_hz, demo_recording, model, own, prefix=prefix)
@@ -157,9 +157,9 @@ def _named(recording: "Recording", prefix: str) -> "Recording":
     """Return a recording whose sensors' names begin with `prefix`."""
     return replace(
         recording,
-        tracks=tuple(replace(one, sensor=prefix + one.sensor) for one in recording.tracks),
-        mountings={prefix + sensor: one for sensor, one in recording.mountings.items()},
-        poses=[one if one.sensor is None else replace(one, sensor=prefix + one.sensor) for one in recording.poses],
+        tracks=tuple(replace(track, sensor=prefix + track.sensor) for track in recording.tracks),
+        mountings={prefix + sensor: mounting for sensor, mounting in recording.mountings.items()},
+        poses=[pose if pose.sensor is None else replace(pose, sensor=prefix + pose.sensor) for pose in recording.poses],
     )
 
 

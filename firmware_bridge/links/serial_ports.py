@@ -61,14 +61,14 @@ class Port(NamedTuple):
 
 def serial_ports() -> list[Port]:
     """List all serial ports of this machine, by path."""
-    found: list[ListPortInfo] = []
+    listed: list[ListPortInfo] = []
     for _ in range(3):
         # pyserial converts texts to numbers that it could not read from a device that is being unplugged.
         with suppress(TypeError, ValueError, OSError):
-            found = list(list_ports.comports())
+            listed = list(list_ports.comports())
             break
     ports: list[Port] = []
-    for info in found:
+    for info in listed:
         usb_id = None if info.vid is None or info.pid is None else (info.vid, info.pid)
         place, _, interface = (info.location or "").partition(":")
         texts = (info.product or None, info.manufacturer or None, interface or None, place or None)
@@ -90,12 +90,14 @@ def latency_timer_ms(port: str) -> int | None:
 
 def find_adapter(ports: Sequence[Port]) -> Port:
     """Return the only recognised adapter among `ports`; raises NoDeviceError if there is none, or several."""
-    found = [port for port in ports if port.adapter is not None]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        names = ", ".join(f"{port.adapter} at {port.path}" for port in found)
-        raise NoDeviceError(f"{len(found)} adapters found, {names}: name one, {_example(found[0])}. {_seen(ports)}")
+    adapters = [port for port in ports if port.adapter is not None]
+    if len(adapters) == 1:
+        return adapters[0]
+    if adapters:
+        names = ", ".join(f"{port.adapter} at {port.path}" for port in adapters)
+        raise NoDeviceError(
+            f"{len(adapters)} adapters found, {names}: name one, {_example(adapters[0])}. {_seen(ports)}"
+        )
     raise NoDeviceError(
         f"no known adapter found: name a port, --source slcan:PORT, or try --source demo. {_seen(ports)}"
     )
@@ -103,14 +105,14 @@ def find_adapter(ports: Sequence[Port]) -> Port:
 
 def find_by_serial(serial_number: str, ports: Sequence[Port]) -> Port:
     """Return the port whose USB device has this serial number; raises NoDeviceError unless there is one."""
-    found = [port for port in ports if port.serial_number == serial_number]
-    if len(found) != 1:
-        count = len(found) or "no"
+    matching = [port for port in ports if port.serial_number == serial_number]
+    if len(matching) != 1:
+        count = len(matching) or "no"
         raise NoDeviceError(
             f"{count} port with serial number {serial_number}, expected one"
-            f"{': name one by its path' if found else ''}. {_seen(ports)}"
+            f"{': name one by its path' if matching else ''}. {_seen(ports)}"
         )
-    return found[0]
+    return matching[0]
 
 
 class _UsbDevice(Protocol):
@@ -138,17 +140,21 @@ class Recognised(Generic[_Device]):
     def learn(self, device: _Device, present: Sequence[_Device]) -> None:
         """Remember a device among all that are present."""
         self.device = None if device.identity is None else device
-        self._shared |= [one.identity for one in present].count(device.identity) > 1
+        self._shared |= [other.identity for other in present].count(device.identity) > 1
 
     def find(self, present: Sequence[_Device]) -> _Device | None:
         """Return the remembered device among those that are present; None if it is missing, or cannot be told."""
-        known = self.device
-        same = [one for one in present if known is not None and one.identity == known.identity]
+        remembered = self.device
+        if remembered is None:
+            return None
+        same = [device for device in present if device.identity == remembered.identity]
         self._shared |= len(same) > 1
-        if self._shared and known is not None:
-            same = [one for one in same if one.place == known.place]
-        self.device = same[0] if len(same) == 1 else known
-        return same[0] if len(same) == 1 else None
+        if self._shared:
+            same = [device for device in same if device.place == remembered.place]
+        if len(same) != 1:
+            return None
+        self.device = same[0]
+        return same[0]
 
 
 class PluggedAdapter:
@@ -161,7 +167,7 @@ class PluggedAdapter:
     def __init__(self, path: str) -> None:
         """Identify it by the path of its port, until `find` has its serial number."""
         self._path = path
-        self._known: Recognised[Port] = Recognised()
+        self._recognised: Recognised[Port] = Recognised()
 
     def find(self, ports: Sequence[Port]) -> str:
         """Return the path of its port among the present ones, or the first path if it has no serial number.
@@ -169,21 +175,21 @@ class PluggedAdapter:
         Raises:
             NoDeviceError: it is missing, or another one has the same identity.
         """
-        known = self._known.device
-        if known is None or Path(self._path).is_symlink():
+        adapter = self._recognised.device
+        if adapter is None or Path(self._path).is_symlink():
             real_path = Path(self._path).resolve()
             port = next((port for port in ports if Path(port.path).resolve() == real_path), None)
-            if port is None and known is None:  # a port that is not listed
+            if port is None and adapter is None:  # a port that is not listed
                 return self._path
             if port is None:
                 raise NoDeviceError(f"no adapter at {self._path}: plug it in again. {_seen(ports)}")
-            self._known.learn(port, ports)
+            self._recognised.learn(port, ports)
             return port.path
-        port = self._known.find(ports)
+        port = self._recognised.find(ports)
         if port is None:
             raise NoDeviceError(
-                f"no adapter that is surely the one with serial number {known.serial_number} that was at {known.path}: "
-                f"plug it in where it was. {_seen(ports)}"
+                f"no adapter that is surely the one with serial number {adapter.serial_number} that was at "
+                f"{adapter.path}: plug it in where it was. {_seen(ports)}"
             )
         return port.path
 

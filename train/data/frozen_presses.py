@@ -67,19 +67,19 @@ class FrozenPresses:
 
         It holds no poses, and so only the sequences whose taps were turned at one place, as the schedule states.
         """
-        one = self.presses.only_turned()
-        patterns = one.patterns.astype(np.float32)
-        depth_mm = one.indentation_mm
+        turned = self.presses.only_turned()
+        patterns = turned.patterns.astype(np.float32)
+        depth_mm = turned.indentation_mm
         return FrozenSet(
-            newest=one.counts[:, 0].astype(np.int16),
-            earlier=one.counts[:, 1:].astype(np.int16),
-            tap=np.arange(len(one), dtype=np.int16),
+            newest=turned.counts[:, 0].astype(np.int16),
+            earlier=turned.counts[:, 1:].astype(np.int16),
+            tap=np.arange(len(turned), dtype=np.int16),
             indentation_mm=depth_mm,
-            force_n=one.force_n[:, 2],
+            force_n=turned.force_n[:, 2],
             unit_patterns=(patterns / depth_mm[:, None, None]).astype(np.float16),
-            touched=one.touching,
-            surface=one.family,
-            angle_deg=one.angle_deg[:, 0],
+            touched=turned.touching,
+            surface=turned.family,
+            angle_deg=turned.angle_deg[:, 0],
             full_scale_mm=MAX_INDENTATION_MM,
         )
 

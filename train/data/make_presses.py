@@ -54,7 +54,7 @@ def make_presses(world: World, path: Path) -> PressSet:
         pool = joblib.Parallel()
         for start in range(0, len(missing), _AT_ONCE):
             numbers = missing[start : start + _AT_ONCE]
-            solved = cast(list[PressSet], pool(joblib.delayed(solve_pad)(world, one) for one in numbers))
+            solved = cast(list[PressSet], pool(joblib.delayed(solve_pad)(world, number) for number in numbers))
             for number, part in zip(numbers, solved, strict=True):
                 replace(part, config=facts).save(_part(folder, number))
                 bar.update()

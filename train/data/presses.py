@@ -176,8 +176,8 @@ def load_presses(path: Path) -> PressSet:
         if isinstance(error, DatasetError):
             raise
         raise DatasetError(f"{path} is not a file of presses, or a damaged one ({error}): make it again") from error
-    if (found := loaded.sha256()) != hashed:
-        raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed[:64]}: make it again")
+    if (actual := loaded.sha256()) != hashed:
+        raise DatasetError(f"{path} is damaged: its sha256 is {actual}, it states {hashed[:64]}: make it again")
     return loaded
 
 

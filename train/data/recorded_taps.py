@@ -68,7 +68,7 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
             f"{path} has no poses: record with --poses, or add columns {', '.join(CSV_POSES)} to the CSV"
         )
     times = track.time_ns if track.time_ns is not None and not recording.poses_by_row else np.arange(len(counts))
-    poses = iter([one for one in recording.poses if one.sensor in (None, track.sensor)])
+    poses = iter([pose for pose in recording.poses if pose.sensor in (None, track.sensor)])
     course, due, taps = PoseTrack(), next(poses, None), []
     for frames, peak in _cut(counts):
         time = int(times[peak])
@@ -94,7 +94,7 @@ def recorded_presses(path: Path, entry: SensorEntry, sensor: str) -> list[NDArra
 def _zeroed(path: Path, entry: SensorEntry, sensor: str) -> tuple[Recording, Track, NDArray[np.float32]]:
     """Return a recording, its track of a sensor, and that track's scans (n, 3, rows, cols) over its free pad."""
     recording = load_recording(path)
-    tracks = {one.sensor: one for one in recording.tracks}
+    tracks = {track.sensor: track for track in recording.tracks}
     track = recording.tracks[0] if len(tracks) == 1 else tracks.get(sensor)
     if track is None:
         raise DatasetError(f"{path} has the sensors {', '.join(tracks)}, none of them {sensor}")
@@ -179,18 +179,23 @@ def _plain(held: Any) -> Any:
     return held.plain if isinstance(held, _Array) else held
 
 
+_CORE: Final = {"_reconstruct": _Array, "scalar": lambda number, held: number.read(held)[0]}
+_CONSTRUCTORS: Final[dict[str, dict[str, Any]]] = {
+    "numpy": {"dtype": _Number, "ndarray": object},
+    "numpy.core.multiarray": _CORE,
+    "numpy._core.multiarray": _CORE,
+}
+"""Stand-ins for the constructors that numpy's pickles name, by their modules."""
+
+
 class _Arrays(pickle.Unpickler):
     """Unpickler of lists, dicts, numbers and arrays, which calls none of what a pickle names."""
 
     def find_class(self, module: str, name: str) -> Any:
         """Return what stands for a constructor of numpy's pickles; anything else is refused."""
-        core = module in ("numpy.core.multiarray", "numpy._core.multiarray")
-        if core and name == "scalar":
-            return lambda number, held: number.read(held)[0]
-        known = {"_reconstruct": _Array} if core else {"dtype": _Number, "ndarray": object} if module == "numpy" else {}
-        if name not in known:
+        if name not in _CONSTRUCTORS.get(module, {}):
             raise pickle.UnpicklingError(f"it calls {module}.{name}")
-        return known[name]
+        return _CONSTRUCTORS[module][name]
 
 
 def _published_taps(path: Path) -> list[RecordedTap]:
@@ -200,8 +205,8 @@ def _published_taps(path: Path) -> list[RecordedTap]:
     file = io.BytesIO(path.read_bytes())
     try:
         (npy.read_array_header_1_0 if npy.read_magic(file) == (1, 0) else npy.read_array_header_2_0)(file)
-        held = [_plain(one) for one in _Arrays(file).load().plain]
-        return [_published_tap(one[0] if isinstance(one, list) else one) for one in held]
+        held = [_plain(tap) for tap in _Arrays(file).load().plain]
+        return [_published_tap(tap[0] if isinstance(tap, list) else tap) for tap in held]
     except Exception as error:  # a pickle raises any exception on broken bytes, and each means that the file is broken
         said = " ".join(str(error).split())[:120] or type(error).__name__
         raise DatasetError(f"{path} is not a file of published taps, or a damaged or hostile one: {said}") from error
@@ -298,13 +303,13 @@ def placed(taps: Sequence[RecordedTap], surface: Surface, pad: GrippedPad) -> Pl
         slopes = np.stack([(made(moved + step) - now).ravel() / step.sum() for step in np.diag(_STEPS)], axis=1)
         moved = moved + np.linalg.lstsq(slopes, (wanted - now).ravel(), rcond=1e-3)[0].clip(-2, 2)
         now = made(moved)
-    found = Placed(moved, (before, float(np.median((now * wanted).sum(axis=1)))))
-    if not found.likeness[1] >= LEAST_LIKENESS:
+    fitted = Placed(moved, (before, float(np.median((now * wanted).sum(axis=1)))))
+    if not fitted.likeness[1] >= LEAST_LIKENESS:
         raise DatasetError(
-            f"the readings do not fit what lies under the poses: likeness {found.likeness[1]:.2f}, at least "
+            f"the readings do not fit what lies under the poses: likeness {fitted.likeness[1]:.2f}, at least "
             f"{LEAST_LIKENESS} expected; are the poses those of this surface, from its middle, in mm, y down?"
         )
-    return found
+    return fitted
 
 
 def _shape(z: NDArray[np.floating]) -> NDArray[np.float64]:

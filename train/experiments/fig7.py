@@ -65,10 +65,10 @@ def fig7(bench: Workbench, report: Report) -> None:
     forces_n: list[NDArray[np.float32]] = []
     for mesh in meshes:
         names = tracked(surfaces, f"FEM {mesh}", "surface")
-        found = [press_surface(name, mesh, indentation_mm) for name in names]
-        maps = np.stack([one.patterns_mm for one in found])
-        by_fem[f"FEM {mesh}"] = FemMethod(maps, float(np.mean([one.run_s.sum() for one in found])))
-        forces_n.append(np.stack([one.force_n for one in found]))
+        verdicts = [press_surface(name, mesh, indentation_mm) for name in names]
+        maps = np.stack([verdict.patterns_mm for verdict in verdicts])
+        by_fem[f"FEM {mesh}"] = FemMethod(maps, float(np.mean([verdict.run_s.sum() for verdict in verdicts])))
+        forces_n.append(np.stack([verdict.force_n for verdict in verdicts]))
     truth = by_fem[f"FEM {meshes[0]}"].maps
     methods, beta_mm = _methods(surfaces, indentation_mm, forces_n[0], truth)
     methods |= by_fem
@@ -81,7 +81,7 @@ def fig7(bench: Workbench, report: Report) -> None:
         "surfaces and steps, in brackets the best and the worst surface. What heaps up around the contact counts as 0, "
         "as no PSF pulls, except in the column that is named so.",
     )
-    shares = [100 * float((one / forces_n[0]).mean()) for one in forces_n]
+    shares = [100 * float((force_n / forces_n[0]).mean()) for force_n in forces_n]
     listed = "; ".join(f"{mesh} {share:.1f}" for mesh, share in zip(meshes, shares, strict=True))
     report.say(f"Forces of the finite elements in % of the finest's: {listed}.")
 

@@ -95,7 +95,7 @@ def movement(shear_modulus_mpa: float, poisson: float, depth_mm: float) -> _Arra
 def _gaps(rng: np.random.Generator, x_mm: _Array, y_mm: _Array) -> _Array:
     """Return the gaps of a drawn figure at places: strokes, a disc or ring, a ball, or a roof."""
     kind, turn = rng.choice(4, p=(0.6, 0.15, 0.15, 0.1)), rng.uniform(0, 2 * np.pi)
-    x, y = (one - rng.uniform(-3, 3) for one in (x_mm, y_mm))
+    x, y = (along_mm - rng.uniform(-3, 3) for along_mm in (x_mm, y_mm))
     figure, size_mm, width_mm = rng.integers(len(_FIGURES)), rng.uniform(7, 16), rng.uniform(1.2, 3.5)
     hole, radius_mm, slope = rng.uniform(-0.7, 0.7), 3 * 20 ** rng.random(), 0.02 * 30 ** rng.random()
     x, y = np.cos(turn) * x + np.sin(turn) * y, np.cos(turn) * y - np.sin(turn) * x
@@ -126,7 +126,7 @@ def draw_presses(seed: int, pads: int, per_pad: int, taps: int = 1, series: int 
     poses = np.zeros((taps, 3))
     poses[1:, :2] = USPA44.pitch_mm / 2 * np.array([(1, 0), (0, 1), (1, 1)])[: taps - 1]
     (x, y), pixels = places(_CELLS, USPA44.width_mm), places(_PIXELS, _PATTERN_MM)
-    nearest = tuple(((one + USPA44.width_mm / 2) // _CELL_MM).astype(int) for one in pixels[::-1])
+    nearest = tuple(((along_mm + USPA44.width_mm / 2) // _CELL_MM).astype(int) for along_mm in pixels[::-1])
     for pad in range(pads):
         rng = np.random.default_rng([seed, pad])
         modulus_mpa, poisson = rng.uniform(0.5, 0.9), rng.uniform(0.42, 0.49)
@@ -139,7 +139,7 @@ def draw_presses(seed: int, pads: int, per_pad: int, taps: int = 1, series: int 
             figure, depth_mm, way = int(rng.integers(2**31)), rng.uniform(0.05, 0.5), rng.uniform(0, 2 * np.pi)
             rubs = rng.uniform(0, 0.5) * rng.integers(2)
             solved = [pressed(_gaps(np.random.default_rng(figure), x + dx, y + dy), depth_mm) for dx, dy, _ in poses]
-            pressure = np.array([one for one, _ in solved]) * 2 * np.pi * modulus_mpa / (1 - poisson)
+            pressure = np.array([cells for cells, _ in solved]) * 2 * np.pi * modulus_mpa / (1 - poisson)
             loads = np.array([1, rubs * np.cos(way), rubs * np.sin(way)])
             moved_mm = np.einsum("latc,l,nc->nat", moves, loads, pressure)
             read = per_mm * moved_mm * (1 + 0.5 * moved_mm[:, 2:]) * gains
@@ -149,16 +149,16 @@ def draw_presses(seed: int, pads: int, per_pad: int, taps: int = 1, series: int 
             read = 4 * np.rint((read + drift + rng.normal(0, 3, read.shape)) / 4)
             touching = pressure[0].reshape(_CELLS, _CELLS)[nearest] > 0
             gap_mm = _gaps(np.random.default_rng(figure), *pixels)
-            one = {name: np.zeros(shape) for name, shape in unused.items()} | {
+            row = {name: np.zeros(shape) for name, shape in unused.items()} | {
                 "family": "half-space", "pad": pad, "counts": read.reshape(taps, 3, 4, 4), "poses": poses,
                 "patterns": solved[0][1].reshape(_PIXELS, _PIXELS), "touching": touching.reshape(_PIXELS, _PIXELS),
                 "force_n": loads[[1, 2, 0]] * pressure[0].sum() * _CELL_MM**2, "indentation_mm": depth_mm,
             }  # fmt: skip
-            for name, value in one.items():
+            for name, value in row.items():
                 rows[name].append(value)
             others.append((gains.reshape(3, 4, 4), gap_mm.reshape(_PIXELS, _PIXELS), per_newton))
     kinds = {"family": str, "pad": np.int64, "touching": bool}
     arrays: dict[str, Any] = {name: np.array(values, kinds.get(name, np.float32)) for name, values in rows.items()}
     presses = PressSet(**arrays)
-    gains_of, gaps_mm, newtons = (np.array(one, np.float32) for one in zip(*others, strict=True))
+    gains_of, gaps_mm, newtons = (np.array(column, np.float32) for column in zip(*others, strict=True))
     return Pressed(FrozenPresses(presses, gains_of), gaps_mm, newtons)

@@ -92,12 +92,6 @@ def trained(bench: Workbench, training: Training, data: PressSet, validation: Fr
     return bench.network(training, data, validation)
 
 
-def compact_methods(bench: Workbench, data: PressSet, names: Sequence[str]) -> list[Method]:
-    """Return compact networks by name (stsr, mtsr2, ...), trained on `data` where no checkpoint exists."""
-    validation = bench.frozen("validation")
-    return [replace(trained(bench, compact(name), data, validation), name=name) for name in names]
-
-
 def classical_methods(bench: Workbench, data: PressSet, names: Sequence[str]) -> list[Method]:
     """Return methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
     path = bench.data_folder / f"classical-{data.sha256()[:10]}.npz"
@@ -184,7 +178,7 @@ def table3(bench: Workbench, report: Report) -> None:
     # The paper's networks, which are large, are calibrated on few frames.
     networks = [(name, published(name), sets["validation"]) for name in (*names, "stsr longer")]
     networks += [(f"compact {name}", compact(name), validation) for name in ("stsr", "mtsr2", "mtsr4", "mtsr7")]
-    compared = {one.name: one for one in classical_methods(bench, data, ("bilinear", "bicubic", "linear map"))}
+    compared = {method.name: method for method in classical_methods(bench, data, ("bilinear", "bicubic", "linear map"))}
     for name, training, calibrated_on in tracked(networks, "networks", "network"):
         compared[name] = trained(bench, training, data, calibrated_on)
     test, rows, test_db = sets["test"], list[Row](), dict[str, NDArray[np.float64]]()
@@ -294,7 +288,8 @@ def unseen(bench: Workbench, report: Report) -> None:
     numbers = range(TEST_SEED, TEST_SEED + TEST_FIGURES)
     glyphs, polygons = ([f"{kind}:{number}" for number in numbers] for kind in ("glyph", "polygon"))
     surfaces = {"15 seen": KNOWN, "3 held out": HELD_OUT, "glyphs": glyphs, "polygons": polygons}
-    tests, validation = {name: bench.frozen("test", one) for name, one in surfaces.items()}, bench.frozen("validation")
+    tests = {name: bench.frozen("test", names) for name, names in surfaces.items()}
+    validation = bench.frozen("validation")
     networks = {
         name: bench.network(training, data, validation if training is _EVERY else bench.frozen("validation", KNOWN))
         for name, (training, data) in training_sets(bench).items()
@@ -332,13 +327,13 @@ def unseen(bench: Workbench, report: Report) -> None:
 
 def training_sets(bench: Workbench) -> dict[str, tuple[Training, PressSet]]:
     """Return the trainings with their presses, by name; all but the last are without the held-out surfaces."""
-    known, held_out, figures = (presses(bench, name).at_scale(_EVERY.scale) for name in SETS)
+    seen, held_out, figures = (presses(bench, name).at_scale(_EVERY.scale) for name in SETS)
     few = figures.pick(np.arange(min(833, len(figures))))  # a tenth of the windows; both kinds alternate
     half = replace(_EVERY.recipe, steps=_EVERY.recipe.steps // 2)
     return {
-        "15": (replace(_EVERY, name="unseen-alone"), known),
-        "15, half as long": (replace(_EVERY, name="unseen-alone-half", recipe=half), known),
-        "15 + 833 figures": (replace(_EVERY, name="unseen-few"), join_presses([known, few])),
-        "15 + figures": (replace(_EVERY, name="unseen-both"), join_presses([known, figures])),
-        "18 + figures": (_EVERY, join_presses([known, held_out, figures])),
+        "15": (replace(_EVERY, name="unseen-alone"), seen),
+        "15, half as long": (replace(_EVERY, name="unseen-alone-half", recipe=half), seen),
+        "15 + 833 figures": (replace(_EVERY, name="unseen-few"), join_presses([seen, few])),
+        "15 + figures": (replace(_EVERY, name="unseen-both"), join_presses([seen, figures])),
+        "18 + figures": (_EVERY, join_presses([seen, held_out, figures])),
     }

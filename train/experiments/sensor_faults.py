@@ -69,8 +69,8 @@ def _places(order: Callable[[np.random.Generator], NDArray[np.integer]]) -> Faul
 def _neighbours(rng: np.random.Generator) -> NDArray[np.integer]:
     order = np.arange(USPA44.taxel_count)
     row, col = rng.integers(USPA44.rows), rng.integers(USPA44.cols - 1)
-    one = row * USPA44.cols + col
-    order[[one, one + 1]] = one + 1, one
+    taxel = row * USPA44.cols + col
+    order[[taxel, taxel + 1]] = taxel + 1, taxel
     return order
 
 

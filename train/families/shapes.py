@@ -207,10 +207,10 @@ def _screw(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
 
 
 def _button(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
-    radius, hole, apart = rng.uniform(4, 9), rng.uniform(0.6, 1.1), rng.uniform(1.2, 2.0)
+    radius, hole, offset = rng.uniform(4, 9), rng.uniform(0.6, 1.1), rng.uniform(1.2, 2.0)
     holes, rim = int(rng.choice([2, 4])), rng.uniform(0.1, 0.4)
     away = np.hypot(x, y)
-    pierced = np.hypot(abs(x) - apart, y if holes == 2 else abs(y) - apart) < hole
+    pierced = np.hypot(abs(x) - offset, y if holes == 2 else abs(y) - offset) < hole
     return where((away < radius) & ~pierced, np.where(away > 0.75 * radius, 0.0, -rim))
 
 
@@ -259,10 +259,10 @@ def _pen(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
 
 
 def _plug(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
-    apart, wide, long = rng.uniform(2.5, 8), rng.uniform(0.8, 1.8), rng.uniform(2, 7)
+    offset, wide, long = rng.uniform(2.5, 8), rng.uniform(0.8, 1.8), rng.uniform(2, 7)
     pins = int(rng.choice([2, 3]))
-    inside = (abs(abs(x) - apart) < wide) & (abs(y) < long / 2)
-    return raised(inside | ((np.hypot(x, y - apart) < wide) & (pins == 3)), 3.0)
+    inside = (abs(abs(x) - offset) < wide) & (abs(y) < long / 2)
+    return raised(inside | ((np.hypot(x, y - offset) < wide) & (pins == 3)), 3.0)
 
 
 SOLIDS: Final[tuple[Shape, ...]] = (

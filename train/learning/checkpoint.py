@@ -26,15 +26,7 @@ from train.data.press_batches import Batch, OneSensor, PosedBatches, PressBatche
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
 from train.learning.interval_fit import calibrate, interval_coverage
-from train.learning.training_loop import (
-    DAMAGES,
-    Recipe,
-    device_of_rank,
-    rank_and_world,
-    reason,
-    train,
-    wait_for_all,
-)
+from train.learning.training_loop import DAMAGES, Recipe, device_of_rank, rank_and_world, reason, train, wait_for_all
 from train.networks.blocks import Objective, PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.named_networks import build, grown

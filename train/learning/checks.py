@@ -74,9 +74,9 @@ def _shuffled(rng: np.random.Generator, counts: Counts) -> Counts:
 
 
 def _two_exchanged(rng: np.random.Generator, counts: Counts) -> Counts:
-    rows, (one, other) = np.arange(len(counts)), rng.integers(USPA44.taxel_count, size=(2, len(counts)))
+    rows, (first, second) = np.arange(len(counts)), rng.integers(USPA44.taxel_count, size=(2, len(counts)))
     order = np.tile(np.arange(USPA44.taxel_count), (len(counts), 1))
-    order[rows, one], order[rows, other] = other, one
+    order[rows, first], order[rows, second] = second, first
     return _rearranged(counts, order)
 
 
@@ -158,13 +158,13 @@ def drawn_readings(presses: PressSet, seed: int) -> tuple[Counts, NDArray[np.flo
     rng = np.random.default_rng([seed, 4])
     certainty = np.array(_CERTAINTIES, dtype=np.float32)[rng.integers(len(_CERTAINTIES), size=len(presses))]
     readings = np.empty(presses.counts[:, 0].shape, dtype=np.float32)
-    for one in sorted(set(_CERTAINTIES)):
-        part = certainty == np.float32(one)
+    for level in sorted(set(_CERTAINTIES)):
+        part = certainty == np.float32(level)
         if part.any():
-            nuisances = Nuisances(gain_spread=Nuisances().gain_spread * (1 - one))
+            nuisances = Nuisances(gain_spread=Nuisances().gain_spread * (1 - level))
             readings[part] = read_presses(presses.pick(part).with_taps(1), nuisances, int(rng.integers(2**62)))[:, 0]
-    known = rng.random(presses.constants.shape) < rng.choice([0, 0, 0.5, 1], size=(len(presses), 1))
-    return readings, known_numbers(presses.constants, known, certainty)
+    stated = rng.random(presses.constants.shape) < rng.choice([0, 0, 0.5, 1], size=(len(presses), 1))
+    return readings, known_numbers(presses.constants, stated, certainty)
 
 
 def features_of(counts: Counts, pads: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -223,7 +223,7 @@ def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
             off = np.abs(stated[:, 1, :3] - pose)
             near = (np.hypot(*off[:, :2].T) <= _FAR * stated[:, 1, 3]) & (off[:, 2] <= _FAR * stated[:, 1, 4])
             right.append(pair_features(pair[near], stated[near]))
-            wrong += [pair_features(*one) for one in _wrong(rng, pair, pose, stated)]
+            wrong += [pair_features(*faulty) for faulty in _wrong(rng, pair, pose, stated)]
     return fit_classifier(np.concatenate(right), np.concatenate(wrong), (192, 96), steps, seed, 0.1)
 
 
@@ -242,7 +242,8 @@ def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, see
 def pair_features(pairs: Counts, poses: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the features (n, inputs) of pairs of taps (n, 2, 3, rows, cols) in counts, with poses (n, 2, 5)."""
     none = np.empty((0, pair_width(int(np.prod(pairs.shape[2:])))), np.float32)
-    return np.concatenate([none, *(pose_tap_features(*one) for one in zip(in_units(pairs), poses, strict=True))])
+    rows = [pose_tap_features(pair, pose) for pair, pose in zip(in_units(pairs), poses, strict=True)]
+    return np.concatenate([none, *rows])
 
 
 def relative(newest: NDArray[np.floating], earlier: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -317,8 +318,8 @@ def fit_classifier(
         loss.backward()
         optimizer.step()
         schedule.step()
-    found = [(layer.weight.detach().double().numpy(), layer.bias.detach().double().numpy()) for layer in layers]
+    fitted = [(layer.weight.detach().double().numpy(), layer.bias.detach().double().numpy()) for layer in layers]
     # The features are centred and scaled by the first layer, so that the runtime has nothing to know of it.
-    weights, offsets = found[0]
-    found[0] = (weights / spread, offsets - (weights / spread) @ centre)
-    return small_network(SmallNetwork(found).to_json())  # as the contract holds it
+    weights, offsets = fitted[0]
+    fitted[0] = (weights / spread, offsets - (weights / spread) @ centre)
+    return small_network(SmallNetwork(fitted).to_json())  # as the contract holds it

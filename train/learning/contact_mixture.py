@@ -80,11 +80,11 @@ def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArra
     return flat / np.maximum(scale, 1.0), usable
 
 
-def scaled_constants(pad: Pad, cross_talk: float = 0.5) -> NDArray[np.float64]:
-    """Return CONSTANTS of a pad over half of their ranges, (p,); `cross_talk` is a share of the largest."""
+def scaled_constants(pad: Pad) -> NDArray[np.float64]:
+    """Return CONSTANTS of a pad over half of their ranges, (p,); the last is of its sensor, and in the middle."""
     bounds = ((name, *RANGES[name]) for name in CONSTANTS[:-1])
     scaled = [2 * (getattr(pad, name) - low) / (high - low) - 1 for name, low, high in bounds]
-    return np.array([*scaled, 2 * cross_talk - 1])
+    return np.array([*scaled, 0.0])
 
 
 def place_effects(pad: Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -122,17 +122,17 @@ def even_contacts(presses: PressSet, seed: int) -> tuple[NDArray[np.float64], ND
     return contacts[usable], constants[usable]
 
 
-def fit_mixture(presses: PressSet, seed: int = 0) -> ContactMixture:
+def fit_mixture(presses: PressSet) -> ContactMixture:
     """Fit the mixture by expectation-maximisation to presses, as of `even_contacts`.
 
     DatasetError if they are fewer than two for each channel.
     """
-    contacts, constants = even_contacts(presses, seed)
+    contacts, constants = even_contacts(presses, seed=0)
     design = np.insert(constants, 0, 1.0, axis=1)
     components = min(48, len(contacts) // (2 * CHANNELS))
     if not components:
         raise DatasetError(f"{len(contacts)} presses strong enough, expected {2 * CHANNELS} or more: make more")
-    mixture = _fitted(contacts, design, _nearest(contacts, np.random.default_rng(seed), components))
+    mixture = _fitted(contacts, design, _nearest(contacts, np.random.default_rng(0), components))
     for _ in range(_ROUNDS):
         mixture = _fitted(contacts, design, _given_constants(mixture, contacts, design))
     return mixture
@@ -144,7 +144,7 @@ Sensor = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
 
 def sensors_of(presses: PressSet, world: World) -> list[Sensor]:
     """Return the sensors that read the presses of a world, one for each pad, with chips of their own."""
-    found: list[Sensor] = []
+    sensors: list[Sensor] = []
     spread, read_by = Nuisances().gain_spread, Nuisances().without("gain_spread")
     # Sets number their pads with gaps, in the order in which they were drawn.
     for number, pad_number in zip(range(world.chunks), np.unique(presses.pad), strict=True):
@@ -156,8 +156,8 @@ def sensors_of(presses: PressSet, world: World) -> list[Sensor]:
         true -= true[AXES.index("z")].mean()
         clean = presses.pick(presses.pad == pad_number).counts[:, 0] * chips.astype(np.float32)
         contacts = apply_nuisances(clean[None, :, None], read_by, [world.seed, number])[0, :, 0]
-        found.append((contacts, true.ravel(), scaled_constants(pad)))
-    return found
+        sensors.append((contacts, true.ravel(), scaled_constants(pad)))
+    return sensors
 
 
 def _even_z(gripped: GrippedPad) -> NDArray[np.float64]:
@@ -169,13 +169,16 @@ def _even_z(gripped: GrippedPad) -> NDArray[np.float64]:
 def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactModel:
     """Return the model with its mean error on sensors taken out, and with intervals that hold nine in ten values."""
     plain = [learned(contacts, mixture.model(), 1) for contacts, _, _ in sensors]
-    off = [np.log(one.gains) - true for one, (_, true, _) in zip(plain, sensors, strict=True)]
+    off = [np.log(learner.gains) - true for learner, (_, true, _) in zip(plain, sensors, strict=True)]
     bias = _symmetric(np.mean(off, axis=0))
     taught = [learned(contacts, mixture.model(1.0, bias), 1) for contacts, _, _ in sensors]
-    gains = [(np.log(one.gains) - true) / one.deviations for one, (_, true, _) in zip(taught, sensors, strict=True)]
+    gains = [
+        (np.log(learner.gains) - true) / learner.deviations
+        for learner, (_, true, _) in zip(taught, sensors, strict=True)
+    ]
     constants = [
-        ((one.constants - true) / one.constant_deviations)[:-1][one.determined[:-1]]
-        for one, (_, _, true) in zip(taught, sensors, strict=True)  # the cross-talk of a sensor is not available
+        ((learner.constants - true) / learner.constant_deviations)[:-1][learner.determined[:-1]]
+        for learner, (_, _, true) in zip(taught, sensors, strict=True)  # the cross-talk of a sensor is not available
     ]
     return mixture.model(_widening(gains), bias, _widening(constants))
 

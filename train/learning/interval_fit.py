@@ -30,6 +30,7 @@ from train.physics.sensor_noise import Nuisances
 
 LEVEL: Final = 0.9
 LEVELS: Final = (0.5, 0.8, 0.9, 0.95)
+_SEED: Final = 0  # of the fit of a correction
 _SAMPLES: Final = 24  # pixels of each region of a window
 _RATE: Final = 5e-3
 _LEAST_RATIO: Final = 1e-3
@@ -82,7 +83,7 @@ def readings_of_presses(
     Of `sensor` is known what its file states, and nothing.
     """
     presses = presses if posed or taps == 1 else presses.only_turned()
-    found = []
+    readings = []
     for number in range(times):
         frozen = freeze_presses(presses, SEED + number, Nuisances() if sensor is None else sensor.nuisances)
         poses = None
@@ -93,16 +94,16 @@ def readings_of_presses(
             pads = frozen.pads(known=known)
             if sensor is not None:
                 pads[:] = known * np.array(sensor.row)
-            found.append(Readings(windows, pads, frozen.patterns(), poses))
-    return found
+            readings.append(Readings(windows, pads, frozen.patterns(), poses))
+    return readings
 
 
-def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, seed: int = 0, steps: int = 2000) -> None:
+def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, steps: int = 2000) -> None:
     """Add a correction to a trained network in evaluation mode, fitted on presses, some of them with all its taps."""
-    torch.manual_seed(seed)
+    torch.manual_seed(_SEED)
     correction = net.add_intervals()
     correction.contact_level.fill_(contact_level)
-    summary, later, ratios = _samples(net, correction, presses, seed)
+    summary, later, ratios = _samples(net, correction, presses)
     spread = summary.std(dim=0)
     correction.centre.copy_(summary.mean(dim=0))
     correction.spread.copy_(torch.where(spread > 1e-3, spread, torch.ones_like(spread)))
@@ -133,17 +134,17 @@ def conform(net: CompactNet, run: Run, readings: Sequence[Readings]) -> dict[str
     pooled: list[list[NDArray[np.floating]]] = [[] for _ in REGIONS]
     for given in tracked(range(1, net.taps + 1), "intervals", "taps"):
         ratios = _ratios(correction, run, given, readings)
-        wanted = [float(np.quantile(one, LEVEL, method="higher")) if one.size else 1.0 for one in ratios]
+        wanted = [float(np.quantile(region, LEVEL, method="higher")) if region.size else 1.0 for region in ratios]
         shift = torch.tensor(wanted).clamp_min(_LEAST_RATIO).log()
         correction.shift(given, shift)
-        for parts, one, by in zip(pooled, ratios, shift.exp().tolist(), strict=True):
-            parts.append(one / by)
-    found = [np.concatenate(parts) for parts in pooled]
+        for parts, region, by in zip(pooled, ratios, shift.exp().tolist(), strict=True):
+            parts.append(region / by)
+    scaled = [np.concatenate(parts) for parts in pooled]
     return {
         f"{100 * level:g}": [
             # Half of the pixels far from a contact may be exact zeros, as the truth is.
-            float(f"{unit * max(np.quantile(one, level), _LEAST_RATIO):.4g}") if one.size else unit
-            for one in found
+            float(f"{unit * max(np.quantile(region, level), _LEAST_RATIO):.4g}") if region.size else unit
+            for region in scaled
         ]
         for level in LEVELS
     }
@@ -154,20 +155,18 @@ def _ratios(
 ) -> list[NDArray[np.floating]]:
     """Return errors over half widths in each region, with the newest `given` taps."""
     parts: list[list[NDArray[np.floating]]] = [[] for _ in REGIONS]
-    for one in readings:
-        pattern, deviation = run(one.with_taps(given), one.pads, one.poses)[:2]
-        ratio = np.abs(pattern - one.truth) / half_width_mm(deviation)
+    for reading in readings:
+        pattern, deviation = run(reading.with_taps(given), reading.pads, reading.poses)[:2]
+        ratio = np.abs(pattern - reading.truth) / half_width_mm(deviation)
         region = regions(pattern, float(correction.contact_level), correction.near)
         for number, part in enumerate(parts):
             part.append(ratio[region == number])
     return [np.concatenate(part) for part in parts]
 
 
-def _samples(
-    net: CompactNet, correction: IntervalCorrection, presses: PressSet, seed: int
-) -> tuple[Tensor, Tensor, Tensor]:
+def _samples(net: CompactNet, correction: IntervalCorrection, presses: PressSet) -> tuple[Tensor, Tensor, Tensor]:
     """Return inputs of the factors (n, ...), taps (n, K - 1), and logarithms of errors over half widths (n, 4, m)."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     presses = presses if net.takes_poses or net.taps == 1 else presses.only_turned()
     whole = presses.with_taps(net.taps)
     usable = np.flatnonzero(whole.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps >= net.taps))
@@ -177,9 +176,9 @@ def _samples(
     chosen = whole.pick(rng.permutation(np.concatenate(kept))) if kept else whole
     at_once = min(512, len(chosen))
     batches = PosedBatches if net.takes_poses else PressBatches
-    draw = batches(chosen, (1 / net.taps,) * net.taps, at_once, seed)
+    draw = batches(chosen, (1 / net.taps,) * net.taps, at_once, _SEED)
     unit = float(half_width_mm(1.0))
-    found: list[tuple[Any, ...]] = []
+    samples: list[tuple[Any, ...]] = []
     # Two sensors read each press.
     for number in tracked(range(max(2 * len(chosen) // at_once, 1)), "intervals", "batch"):
         batch = draw(number)
@@ -190,9 +189,9 @@ def _samples(
             _, summary = correction.summary(seen.features, pattern, seen.deviation, seen.about, seen.later)
             error = (pattern - batch.pattern / seen.newest).abs() + 1e-6
             region = regions(pattern.numpy(), float(correction.contact_level), correction.near)
-            found.append((summary, seen.later, _drawn(torch.log(error / (seen.deviation * unit)), region)))
+            samples.append((summary, seen.later, _drawn(torch.log(error / (seen.deviation * unit)), region)))
     # A copy, because tensors of inference take no gradient.
-    inputs, later, ratios = (torch.cat(parts).clone() for parts in zip(*found, strict=True))
+    inputs, later, ratios = (torch.cat(parts).clone() for parts in zip(*samples, strict=True))
     return inputs, later, ratios
 
 

@@ -332,8 +332,8 @@ class HeteroscedasticError(Objective):
         pattern, deviation, traction = net(batch.window, batch.pad, *posed)
         loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
         if batch.traction is not None:
-            known = batch.traction.isfinite().all(dim=(1, 2, 3))  # of a real sensor's taps it is not
-            traction, truth = traction[known], batch.traction[known]
+            simulated = batch.traction.isfinite().all(dim=(1, 2, 3))  # of a real sensor's taps it is not
+            traction, truth = traction[simulated], batch.traction[simulated]
             size = truth.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(0.05)
             loss = loss + 0.2 * ((traction - truth).abs() / size).mean()
         return loss

@@ -165,7 +165,7 @@ class _Carrier:
         self._taps, self._grid, self._cells = poses.shape[:2], grid, _CELLS**2 * grid[0] * grid[1]
         self.any = (there.sum(dim=1) > 0).to(poses.dtype)
         self._there = there.transpose(1, 2)[..., 0]  # (n, 1, k - 1, 1)
-        constants = [torch.from_numpy(one).to(poses.dtype) for one in (*_encoding(), *_geometry(*grid))]
+        constants = [torch.from_numpy(array).to(poses.dtype) for array in (*_encoding(), *_geometry(*grid))]
         factors, offsets, here, course, spread = constants
         turn = torch.deg2rad(poses[..., 2:3])
         cosine, sine = torch.cos(turn), torch.sin(turn)
@@ -228,19 +228,19 @@ def _geometry(rows: int, cols: int) -> tuple[NDArray[np.float32], NDArray[np.flo
     part_y, part_x, row, col = np.meshgrid(*map(np.arange, (_CELLS, _CELLS, rows, cols)), indexing="ij")
     x = (_CELLS * col + part_x - (_CELLS * cols - 1) / 2).ravel()
     y = (_CELLS * row + part_y - (_CELLS * rows - 1) / 2).ravel()
-    away, none, one = x * x + y * y, np.zeros_like(x), np.ones_like(x)
+    away, zeros, ones = x * x + y * y, np.zeros_like(x), np.ones_like(x)
     order = np.lexsort((x, y))  # the newest tap's rows and columns
-    here = np.stack([x, y, one, away], axis=1)[order]
+    here = np.stack([x, y, ones, away], axis=1)[order]
     course = np.concatenate(
         [  # of x there, y there, minus half their squares, and the constant
-            *(x, y, none, none),
-            *(-y, x, none, none),
-            *(one, none, none, none),
-            *(none, one, none, none),
-            *(none, none, -x, none),
-            *(none, none, -y, none),
-            *(none, none, -one / 2, none),
-            *(none, none, -away / 2, -one / 2),
+            *(x, y, zeros, zeros),
+            *(-y, x, zeros, zeros),
+            *(ones, zeros, zeros, zeros),
+            *(zeros, ones, zeros, zeros),
+            *(zeros, zeros, -x, zeros),
+            *(zeros, zeros, -y, zeros),
+            *(zeros, zeros, -ones / 2, zeros),
+            *(zeros, zeros, -away / 2, -ones / 2),
         ]
     ).reshape(8, -1)
-    return here.astype(np.float32), course.astype(np.float32), np.stack([one, away]).astype(np.float32)
+    return here.astype(np.float32), course.astype(np.float32), np.stack([ones, away]).astype(np.float32)

@@ -29,6 +29,7 @@ MAX_TAPS: Final = 7
 _NORM_START: Final = 0.1  # initial scale and shift of batch normalisation, as in the authors' code
 _CRITIC_CHANNELS: Final = (32, 64, 128)
 _SLOPE: Final = 0.2
+_ADVERSARIAL_SHARE: Final = 1e-3  # of the discriminator's score in the loss of the generator
 
 
 class _PublishedNet(PatternNet):
@@ -177,14 +178,11 @@ class SrganObjective(Objective):
     Source: Gulrajani et al. 2017, Algorithm 1.
     """
 
-    def __init__(
-        self, device: torch.device | str = "cpu", share: float = 1e-3, learning_rate: float = 1e-4, seed: int = 0
-    ) -> None:
+    def __init__(self, device: torch.device | str = "cpu", seed: int = 0) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.critic = Discriminator().to(device)
-        self._optimizer = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, betas=(0.0, 0.9))
-        self._share = share
+        self._optimizer = torch.optim.Adam(self.critic.parameters(), lr=1e-4, betas=(0.0, 0.9))
         self._rng = torch.Generator().manual_seed(seed)
         self._seen: tuple[Tensor, Tensor] | None = None
 
@@ -194,7 +192,7 @@ class SrganObjective(Objective):
         size = truth_size(truth)
         self._seen = (patterns.detach() / size, truth / size)
         self.critic.requires_grad_(False)
-        return relative_error(patterns, truth) - self._share * self.critic(patterns / size).mean()
+        return relative_error(patterns, truth) - _ADVERSARIAL_SHARE * self.critic(patterns / size).mean()
 
     def after_step(self) -> None:
         """Train the discriminator on the last batch of `loss`."""

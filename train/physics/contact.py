@@ -139,8 +139,8 @@ class ContactSolver:
             # The pressure on the covered share is 1 / share times the cell's mean.
             give = self.cell_compliance_mm_per_mpa * torch.where(share > 0, 1 / share - 1, 0.0)
             sides = None if self._side_give is None else self._side_give.boxes(*place[1:])
-            found, error = self._conjugate_gradients(depth, press, tolerance, give, sides)
-            pressure_mpa[place] = found.numpy()
+            pressure, error = self._conjugate_gradients(depth, press, tolerance, give, sides)
+            pressure_mpa[place] = pressure.numpy()
             residual[poses] = error.numpy()
         return pressure_mpa, residual
 
@@ -270,13 +270,13 @@ class FrictionSolver:
         traction_mpa = np.zeros((count, 2, self.size, self.size), dtype=np.float32)
         residual = np.zeros(count, dtype=np.float32)
         for poses, place in self._grid.boxes(limit_mpa > 0):
-            found, error = self._projected_gradients(
+            traction, error = self._projected_gradients(
                 torch.as_tensor(limit_mpa[place], dtype=self._dtype)[:, None],
                 torch.as_tensor(np.stack([part[place] for part in moved_mm], axis=1), dtype=self._dtype),
                 tolerance,
             )
             for part, axis in zip(traction_mpa.swapaxes(0, 1), range(2), strict=True):
-                part[place] = found[:, axis].numpy()
+                part[place] = traction[:, axis].numpy()
             residual[poses] = error.numpy()
         return traction_mpa, residual
 
@@ -343,5 +343,5 @@ def _project(traction: torch.Tensor, limit: torch.Tensor) -> torch.Tensor:
     return traction * (limit / torch.maximum(size, limit).clamp_min(1e-30))
 
 
-def _dot(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    return (one * other).sum(dim=(1, 2, 3), keepdim=True)
+def _dot(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    return (first * second).sum(dim=(1, 2, 3), keepdim=True)

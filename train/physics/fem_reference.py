@@ -75,8 +75,8 @@ class Verdict:
 def press_surface(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating]) -> Verdict:
     """Press a named surface into the middle of the pad at rising indentations (s,)."""
     pad = FemPad(*mesh)
-    found = pad.press(depth_image(relief(surface), CENTRE, pad.size, pad.cell_mm), indentation_mm)
-    return Verdict(pad.pattern(found.displacement_mm), found.force_n.astype(np.float32), found.run_s)
+    presses = pad.press(depth_image(relief(surface), CENTRE, pad.size, pad.cell_mm), indentation_mm)
+    return Verdict(pad.pattern(presses.displacement_mm), presses.force_n.astype(np.float32), presses.run_s)
 
 
 class FemPresses(NamedTuple):
@@ -117,8 +117,8 @@ class FemPad:
         because its rim is the pad's up to a fraction of a cell. NoEquilibriumError if the elements do not converge.
         """
         press = _Press(self._region, self._rubber, self.size)
-        found = [press.advance(float(step_mm), step_mm - depth_mm) for step_mm in indentation_mm]
-        return FemPresses(*map(np.array, zip(*found, strict=True)))
+        steps = [press.advance(float(step_mm), step_mm - depth_mm) for step_mm in indentation_mm]
+        return FemPresses(*map(np.array, zip(*steps, strict=True)))
 
     def pattern(self, displacement_mm: NDArray[np.floating]) -> NDArray[np.float32]:
         """Interpolate node displacements (s, size, size) linearly to the pixels of the pattern at SCALE."""
@@ -249,5 +249,5 @@ class MooneyRivlin(NamedTuple):
 def _at_points(function: Callable[[Tensor], Tensor], gradient: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return a tensor of each point's F, with the points last as in felupe, of gradients (3, 3, ...)."""
     flat = torch.from_numpy(gradient.reshape(3, 3, -1))
-    found = torch.func.vmap(function, in_dims=-1, out_dims=-1)(flat).numpy()
-    return found.reshape(*found.shape[:-1], *gradient.shape[2:])
+    tensors = torch.func.vmap(function, in_dims=-1, out_dims=-1)(flat).numpy()
+    return tensors.reshape(*tensors.shape[:-1], *gradient.shape[2:])

@@ -117,7 +117,9 @@ class GrippedPad:
         for cover, which in _which_of(covers):
             pressure[which], depth[which] = self._pressed(cover, cells_mm[which], share[which], depth[which])
         pressed_mm = depth.astype(np.float32)
-        on_pad_mpa = np.stack([cover.passed_on(one, self.cell_mm) for cover, one in zip(covers, pressure, strict=True)])
+        on_pad_mpa = np.stack(
+            [cover.passed_on(pressure_mpa, self.cell_mm) for cover, pressure_mpa in zip(covers, pressure, strict=True)]
+        )
         sideways_mpa, _ = self._friction.solve(on_pad_mpa, slide_mm, twist_rad, friction)
         loads = np.concatenate([sideways_mpa, on_pad_mpa[:, None]], axis=1)
         across = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
@@ -274,7 +276,7 @@ def _carrying(depth_mm: NDArray[np.floating], cells: int) -> tuple[NDArray[np.fl
 def _which_of(covers: Sequence[Cover]) -> Iterable[tuple[Cover, NDArray[np.int64]]]:
     """Yield each cover once, with the numbers of the presses that have it."""
     for cover in dict.fromkeys(covers):
-        yield cover, np.array([number for number, one in enumerate(covers) if one == cover])
+        yield cover, np.array([number for number, other in enumerate(covers) if other == cover])
 
 
 def _mostly(share: NDArray[np.float32]) -> NDArray[np.bool_]:

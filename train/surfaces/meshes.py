@@ -27,9 +27,9 @@ def mesh_name(path: Path, unit_mm: float = 1.0) -> str:
 
 def mesh_file(name: str) -> tuple[Path, float]:
     """Return the file in a name of `mesh_name`, and its unit in [mm]."""
-    path, found, unit = name.removeprefix(MESH).rpartition(_UNIT)
+    path, stated, unit = name.removeprefix(MESH).rpartition(_UNIT)
     try:
-        return (Path(path), float(unit)) if found else (Path(unit), 1.0)
+        return (Path(path), float(unit)) if stated else (Path(unit), 1.0)
     except ValueError:
         return Path(name.removeprefix(MESH)), 1.0
 
@@ -124,15 +124,15 @@ def _check_size(path: Path, corners: NDArray[np.float64], unit_mm: float) -> Non
     """Refuse a sheet, and a size of which the unit is more likely wrong than the part."""
     extent_mm = np.ptp(corners, axis=0)
     sides = _sides(extent_mm)
-    found = f"{path}: {sides}" + ("" if unit_mm == 1.0 else f" by --unit-mm {unit_mm:g}")
+    size = f"{path}: {sides}" + ("" if unit_mm == 1.0 else f" by --unit-mm {unit_mm:g}")
     if extent_mm.max() > 500:
         raise MeshError(
-            f"{found}, at most 500 mm; "
+            f"{size}, at most 500 mm; "
             "a file is taken to be in mm: pass --unit-mm if it is not (0.001 for micrometres), else cut out a part"
         )
     if extent_mm.max() < 1:
         raise MeshError(
-            f"{found}, at least 1 mm; "
+            f"{size}, at least 1 mm; "
             "a file is taken to be in mm: pass --unit-mm 1000 if it is in metres, 25.4 if in inches"
         )
     spreads = np.linalg.eigvalsh(np.cov(corners, rowvar=False))
