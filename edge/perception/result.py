@@ -39,9 +39,6 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
 }
 """Reasons in a user's words, each with what to look for."""
 
-LEAST_FORCE_N: Final = 0.1
-"""Least z force for a centre of pressure, which noise would move about below it; a tap begins at ten times as much."""
-
 
 class Wrench(NamedTuple):
     """Total force and torque on a pad.
@@ -51,17 +48,14 @@ class Wrench(NamedTuple):
         torque_n_mm: about x, y, z through the middle of the face, in [N mm]; the last is the twist.
         centre_of_pressure_mm: x, y from the middle of the point where the z force alone would give the torques about x
             and y, in [mm]; None if hardly anything presses.
+        shear_ratio: tangential over normal force, whatever the sensor's counts per newton; None if hardly anything
+            presses.
     """
 
     force_n: tuple[float, float, float]
     torque_n_mm: tuple[float, float, float]
     centre_of_pressure_mm: tuple[float, float] | None
-
-    @property
-    def shear_ratio(self) -> float | None:
-        """Tangential over normal force, whatever the sensor's counts per newton; None if hardly anything presses."""
-        x, y, z = self.force_n
-        return math.hypot(x, y) / z if z >= LEAST_FORCE_N else None
+    shear_ratio: float | None
 
 
 class NextTap(NamedTuple):
