@@ -106,7 +106,10 @@ class PatternCheck:
             return TrustVerdict(False, "stuck") if repeats >= REPEATS else TrustVerdict(None)
         trust = self._trust
         (score,) = trust.contact.network(contact_features(newest, self._pad_row))
-        self._weigh(tap, strength, score)
+        if tap != self._tap:
+            self._begin_contact(tap)
+        if strength > self._strongest and math.isfinite(score):
+            self._strongest, self._score = strength, score
         mismatch, explained = None, True
         if traction is not None:
             mismatch = trust.forward.mismatch(self._operator, newest, pattern, traction, self._gain_error)
@@ -128,18 +131,15 @@ class PatternCheck:
             reason = "sensor"
         return TrustVerdict(reason is None, reason, mismatch)
 
-    def _weigh(self, tap: int, strength: float, score: float) -> None:
-        """Add the evidence of each contact once, by its strongest scan, when the next one begins."""
-        if tap != self._tap:
-            if self._tap is not None:
-                # A doubtful contact, up to 1.5, speaks for the sensor; none counts for more than 4.5 either way. So
-                # three clear faults in a row pass 12, and two to four good contacts lead from 12 to 20 below 6.
-                step = min(max(self._score - 1.5, -4.5), 4.5)
-                self._evidence = min(max(self._evidence + step, 0.0), 20.0)
-                self.suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
-            self._tap, self._strongest = tap, -math.inf
-        if strength > self._strongest and math.isfinite(score):
-            self._strongest, self._score = strength, score
+    def _begin_contact(self, tap: int) -> None:
+        """Add the evidence of the contact before, by its strongest scan."""
+        if self._tap is not None:
+            # A doubtful contact, up to 1.5, speaks for the sensor; none counts for more than 4.5 either way. So three
+            # clear faults in a row pass 12, and two to four good contacts lead from 12 to 20 below 6.
+            step = min(max(self._score - 1.5, -4.5), 4.5)
+            self._evidence = min(max(self._evidence + step, 0.0), 20.0)
+            self.suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
+        self._tap, self._strongest = tap, -math.inf
 
 
 def foreign_taps(belonging: Sequence[float], *, posed: bool) -> list[int]:
