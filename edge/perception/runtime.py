@@ -61,7 +61,7 @@ class Sensor:
     """Stages of one sensor, made complete once with what is stored for it.
 
     Attributes:
-        last: its last pattern, which is used again while nothing changes.
+        last: its last pattern, which is used again while nothing changes; None before one, or where none must be.
         pad: its constants and gains.
         learn: learns its gains; None where nothing is to be learned.
         tracker: of its taps.
@@ -75,13 +75,13 @@ class Sensor:
         pad = _of(name, settings.pad)
         check = None if settings.trust is None else PatternCheck(settings.trust, contract)
         self.events: list[Untimed] = []
-        self.last = LastPattern(geometry.scan_shape, every_scan=options.every_scan)
+        self.last: LastPattern | None = None
         self.pad = SensorPad(
             contract, pad, _of(name, settings.counts_per_newton), check, _of(name, settings.scale_intervals)
         )
         self._name = name
         self._received_ns: int | None = None
-        self._checked, self._follows_drift = check is not None, options.follow_drift
+        self._checked, self._options = check is not None, options
         self.tracker = TapTracker(contract.taps, options, (geometry.rows, geometry.cols))
         self._health = Health((geometry.rows, geometry.cols), mounting, settings.estimator)
         notes = notes_on_missing(name, settings.mountings, settings.baselines)
@@ -131,10 +131,10 @@ class Sensor:
             return
         self._doubt(step)
         self._taps(step, track)
-        if self._follows_drift:
+        if self._options.follow_drift:
             self._zeroing.follow_drift(step)
         if not step.contact and self.learn is not None and self.learn.waiting and self.learn.learn(self._health.dead):
-            self.last.estimate = None
+            self.last = None
         if step.doubted:
             step.notes = (*step.notes, *self._doubt.notes)
         elif step.contact and not self._checked:
@@ -161,7 +161,7 @@ class Sensor:
     def finish(self, step: Step, due: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
         """Pass a step through the stages after the model; the newest readings (3, rows, cols) are in network units."""
         step.estimate = made
-        self.last.keep(step, due, made)
+        self.last = None if self._options.every_scan else LastPattern(made, step.scan.number, due)
         if step.doubted:  # nothing follows from it, and nothing is learned
             made.traction = None
             return
@@ -173,7 +173,7 @@ class Sensor:
         if self._taps.advice is not None:
             self._taps.advice.see(step, due.tap)
         if self.learn is not None and self.learn(step, made, due.counts[0], self._health.dead):
-            self.last.estimate = None  # it was made with other gains
+            self.last = None  # it was made with other gains
 
     def zero_again(self, *, force: bool) -> None:
         """Take a new baseline from the next scans, with an event for the outcome; `force` also in contact."""
@@ -186,7 +186,7 @@ class Sensor:
         a contact is believed again once the pad was seen at rest.
         """
         self.tracker.reset()
-        self.last.estimate = None
+        self.last = None
         self._health.forget()
         self._doubt.lose_touch()
         self._zeroing.lose_touch()
@@ -356,7 +356,7 @@ class Runtime:
         if overtaken is not None:
             overtaken[1].overtake()
             ready.append(overtaken[1].freeze())
-        if step.due is not None and not sensor.last.reuse(step, step.due):
+        if step.due is not None and not (sensor.last and sensor.last.reuse(step, step.due)):
             self.waiting[name] = sensor, step, step.due
             return ready
         if overtaken is not None:
