@@ -164,7 +164,10 @@ class Describe:
     def __call__(
         self, made: Estimate, tap: int, newest: NDArray[np.float32], about: tuple[float, float] | None
     ) -> None:
-        """Add to an estimate what follows from its pattern; all others as `Check` takes them."""
+        """Add to the estimate of a tap what follows from its pattern, and from its doubt and RMS, which are `about`.
+
+        The newest readings (3, rows, cols) are in network units.
+        """
         contract, pattern, deviation = self._contract, made.pattern, made.deviation
         if pattern is None:
             raise ValueError("the estimate has no pattern")

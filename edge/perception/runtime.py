@@ -23,7 +23,7 @@ from edge.perception.result import Estimate, LastPattern, Origin, Result, Step, 
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taps import Taps
 from edge.perception.taxel_health import Health, TaxelEstimator
-from edge.perception.trust_check import Check, PatternCheck, SensorPad
+from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.perception.zeroing import BaselineDoubt, Zeroing
 from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads
 from firmware_bridge.links.base import SourceKind
@@ -73,7 +73,7 @@ class Sensor:
         mounting, baseline = settings.mountings.get(name), settings.baselines.get(name)
         mounting = mounting if mounting is not None and mounting.turns_axes else None
         pad = _of(name, settings.pad)
-        check = None if settings.trust is None else PatternCheck(settings.trust, contract)
+        check = None if settings.trust is None else PatternCheck(settings.trust, contract, self.report)
         self.events: list[Untimed] = []
         self.last: LastPattern | None = None
         self.pad = SensorPad(
@@ -81,14 +81,13 @@ class Sensor:
         )
         self._name = name
         self._received_ns: int | None = None
-        self._checked, self._options = check is not None, options
+        self._check, self._options = check, options
         self.tracker = TapTracker(contract.taps, options, (geometry.rows, geometry.cols))
         self._health = Health((geometry.rows, geometry.cols), mounting, settings.estimator)
         notes = notes_on_missing(name, settings.mountings, settings.baselines)
         self._zeroing = Zeroing(self.tracker, self._health, mounting, self.report, settings.unix_time_s, notes)
         self._doubt = BaselineDoubt(options, geometry.taxel_count, self.report)
         self._taps = Taps(self.tracker, self._health, contract, options, self.report)
-        self._check = Check(check, self.tracker, self._health, self.report)
         self._describe = Describe(contract, settings.trust, geometry, self.pad)
         self.learn: Learn | None = None
         if settings.contacts is not None:
@@ -137,7 +136,7 @@ class Sensor:
             self.last = None
         if step.doubted:
             step.notes = (*step.notes, *self._doubt.notes)
-        elif step.contact and not self._checked:
+        elif step.contact and self._check is None:
             step.notes = (*step.notes, UNCHECKED)
         step.gains_certainty, step.scale_error = self.pad.gains_certainty, self.pad.scale_error
         per_newton = self.pad.counts_per_newton
@@ -149,14 +148,14 @@ class Sensor:
     def begin(self, step: Step, due: Window) -> tuple[Estimate, NDArray[np.float32]]:
         """Return an estimate of the taps of a window that belong together, and the model's input for its pattern."""
         scaled = due.counts / self.pad.counts_per_unit
+        if due.poses is None:
+            scaled[due.taps :] = 0
+            return Estimate(due.taps, due.counts[: due.taps], None), scaled
         taps, belonging, dropped = list(range(due.taps)), None, None
-        if due.poses is not None and due.taps > 1 and self._checked and not step.doubted:
-            taps, belonging = self._check.belonging(step, due, scaled)
+        if due.taps > 1 and self._check is not None and not step.doubted:
+            taps, belonging = self._check.taps_of_contact(self.tracker, due, scaled, posed=step.pose is not None)
             dropped = due.taps - len(taps)
-        if due.poses is not None:
-            return Estimate(len(taps), due.counts[taps], due.poses[taps], belonging, dropped), scaled[taps]
-        scaled[due.taps :] = 0
-        return Estimate(due.taps, due.counts[: due.taps], None), scaled
+        return Estimate(len(taps), due.counts[taps], due.poses[taps], belonging, dropped), scaled[taps]
 
     def finish(self, step: Step, due: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
         """Pass a step through the stages after the model; the newest readings (3, rows, cols) are in network units."""
@@ -168,7 +167,10 @@ class Sensor:
         if made.deviation is not None and step.dead:
             made.deviation = made.deviation * self._health.widening
         about = None if made.pattern is None or made.deviation is None else doubt(made.pattern, made.deviation)
-        self._check(made, due.tap, newest, about)
+        if self._check is not None and made.pattern is not None:
+            made.trusted, made.untrusted_reason, made.mismatch = self._check.judge(
+                due.tap, newest, made.pattern, about[0] if about else None, made.traction, self._health.most_repeats
+            )
         self._describe(made, due.tap, newest, about)
         if self._taps.advice is not None:
             self._taps.advice.see(step, due.tap)
@@ -388,11 +390,10 @@ class Runtime:
                 poses.append(made.poses)
         patterns = model.run_together(inputs, pads, *([poses] if poses else []))
         run_time_us = (self._clock_ns() - start_ns) / 1e3
-        deviations, tractions = model.deviation, model.traction
         for row, ((sensor, step, window), made) in enumerate(zip(due, begun, strict=True)):
             made.pattern, step.run_time_us = patterns[row], run_time_us
-            made.deviation = None if deviations is None else deviations[row]
-            made.traction = None if tractions is None else tractions[row]
+            made.deviation = None if model.deviation is None else model.deviation[row]
+            made.traction = None if model.traction is None else model.traction[row]
             sensor.finish(step, window, made, inputs[row][0])
         done_ns = None if clock_ns is None else clock_ns()
         return [step.freeze(done_ns) for _, step, _ in due]
