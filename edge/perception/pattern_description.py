@@ -5,6 +5,7 @@ origin is the middle of the face. Forces and torques act on the pad: pressing is
 about z, is positive if it turns x to y, clockwise for a viewer who looks at the pad from above.
 """
 
+import math
 from functools import lru_cache
 from typing import Final
 
@@ -14,10 +15,12 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract
 from edge.inference.intervals import expect
 from edge.inference.trust_model import GRID, KPA, ForwardModel, Trust, pooling
-from edge.perception.result import LEAST_FORCE_N, Estimate, Wrench
+from edge.perception.result import Estimate, Wrench
 from edge.perception.trust_check import SensorPad
 from firmware_bridge.pad_geometry import SensorGeometry
 
+LEAST_FORCE_N: Final = 0.1
+"""Least z force for a centre of pressure, which noise would move about below it; a tap begins at ten times as much."""
 _N_OF_KPA_MM2: Final = 1e-3
 _SHEAR_PRIOR_N2: Final = 5.0
 """Sum of squared shear, in [N^2], by which a sensor's contacts outweigh the nominal counts per newton of x and y."""
@@ -30,8 +33,9 @@ def wrench_of(traction_kpa: NDArray[np.floating], pixel_mm: float) -> Wrench:
     """
     height, width = traction_kpa.shape[1:]
     fx, fy, fz, tx, ty, tz = (_sums(height, width, pixel_mm) @ traction_kpa.ravel()).tolist()
-    centre = (-ty / fz, tx / fz) if fz >= LEAST_FORCE_N else None
-    return Wrench((fx, fy, fz), (tx, ty, tz), centre)
+    presses = fz >= LEAST_FORCE_N
+    centre, shear_ratio = ((-ty / fz, tx / fz), math.hypot(fx, fy) / fz) if presses else (None, None)
+    return Wrench((fx, fy, fz), (tx, ty, tz), centre, shear_ratio)
 
 
 @lru_cache(maxsize=8)
@@ -160,7 +164,10 @@ class Describe:
     def __call__(
         self, made: Estimate, tap: int, newest: NDArray[np.float32], about: tuple[float, float] | None
     ) -> None:
-        """Add to an estimate what follows from its pattern; all others as `Check` takes them."""
+        """Add to the estimate of a tap what follows from its pattern, and from its doubt and RMS, which are `about`.
+
+        The newest readings (3, rows, cols) are in network units.
+        """
         contract, pattern, deviation = self._contract, made.pattern, made.deviation
         if pattern is None:
             raise ValueError("the estimate has no pattern")

@@ -39,9 +39,6 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
 }
 """Reasons in a user's words, each with what to look for."""
 
-LEAST_FORCE_N: Final = 0.1
-"""Least z force for a centre of pressure, which noise would move about below it; a tap begins at ten times as much."""
-
 
 class Wrench(NamedTuple):
     """Total force and torque on a pad.
@@ -51,17 +48,14 @@ class Wrench(NamedTuple):
         torque_n_mm: about x, y, z through the middle of the face, in [N mm]; the last is the twist.
         centre_of_pressure_mm: x, y from the middle of the point where the z force alone would give the torques about x
             and y, in [mm]; None if hardly anything presses.
+        shear_ratio: tangential over normal force, whatever the sensor's counts per newton; None if hardly anything
+            presses.
     """
 
     force_n: tuple[float, float, float]
     torque_n_mm: tuple[float, float, float]
     centre_of_pressure_mm: tuple[float, float] | None
-
-    @property
-    def shear_ratio(self) -> float | None:
-        """Tangential over normal force, whatever the sensor's counts per newton; None if hardly anything presses."""
-        x, y, z = self.force_n
-        return math.hypot(x, y) / z if z >= LEAST_FORCE_N else None
+    shear_ratio: float | None
 
 
 class NextTap(NamedTuple):
@@ -303,47 +297,32 @@ MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
 """Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
 
 
-class LastPattern:
-    """Estimate of a sensor's last pattern, and what it was made from; allocates no array after construction.
+class LastPattern(NamedTuple):
+    """Estimate of a sensor's last pattern, the number of its scan, and the taps that it was made of."""
 
-    Attributes:
-        estimate: None before the first, and where it must not be used again.
-    """
-
-    def __init__(self, scan_shape: tuple[int, int, int], *, every_scan: bool = False) -> None:
-        """Begin without one; with `every_scan` none is used again."""
-        self._every_scan = every_scan
-        self.estimate: Estimate | None = None
-        self._scan_number = -1
-        self._counts = np.zeros(scan_shape, dtype=np.float32)
-        self._change = np.zeros(scan_shape, dtype=np.float32)
-        self._made_by: Hashable = None
-        self._poses: NDArray[np.float32] | None = None
+    estimate: Estimate
+    scan_number: int
+    made_of: Window
 
     def reuse(self, step: Step, due: Window) -> bool:
         """Give a step the estimate if readings and poses have not changed beyond noise since; return whether it has it.
 
         Nor must the maker have changed, which is what distinguishes the pattern from others.
         """
-        if self._every_scan or self.estimate is None or due.made_by != self._made_by:
+        before = self.made_of
+        if due.made_by != before.made_by:
             return False
-        poses = due.poses
-        if poses is not None and (
-            self._poses is None or poses.shape != self._poses.shape or (np.abs(poses - self._poses) > MOVED).any()
+        if due.poses is not None and (
+            before.poses is None
+            or due.poses.shape != before.poses.shape
+            or (np.abs(due.poses - before.poses) > MOVED).any()
         ):
             return False
-        np.subtract(due.counts[0], self._counts, out=self._change)
-        np.abs(self._change, out=self._change)
+        change = due.counts[0] - before.counts[0]
         # Noise reaches neither five of its deviations in one reading, nor 1.4 of them in the RMS of all.
-        if np.maximum.reduce(self._change, axis=None) > 5 * _CHANGE_COUNTS:
+        if np.maximum.reduce(np.abs(change), axis=None) > 5 * _CHANGE_COUNTS:
             return False
-        if float(np.vdot(self._change, self._change)) > (1.4 * _CHANGE_COUNTS) ** 2 * self._change.size:
+        if float(np.vdot(change, change)) > (1.4 * _CHANGE_COUNTS) ** 2 * change.size:
             return False
-        step.estimate, step.reused_from = self.estimate, self._scan_number
+        step.estimate, step.reused_from = self.estimate, self.scan_number
         return True
-
-    def keep(self, step: Step, due: Window, made: Estimate) -> None:
-        """Keep the estimate of a step's pattern."""
-        self.estimate, self._scan_number = made, step.scan.number
-        self._counts[...] = due.counts[0]
-        self._poses, self._made_by = due.poses, due.made_by

@@ -23,7 +23,7 @@ from edge.perception.result import Estimate, LastPattern, Origin, Result, Step, 
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taps import Taps
 from edge.perception.taxel_health import Health, TaxelEstimator
-from edge.perception.trust_check import Check, PatternCheck, SensorPad
+from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.perception.zeroing import BaselineDoubt, Zeroing
 from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads
 from firmware_bridge.links.base import SourceKind
@@ -61,7 +61,7 @@ class Sensor:
     """Stages of one sensor, made complete once with what is stored for it.
 
     Attributes:
-        last: its last pattern, which is used again while nothing changes.
+        last: its last pattern, which is used again while nothing changes; None before one, or where none must be.
         pad: its constants and gains.
         learn: learns its gains; None where nothing is to be learned.
         tracker: of its taps.
@@ -73,22 +73,21 @@ class Sensor:
         mounting, baseline = settings.mountings.get(name), settings.baselines.get(name)
         mounting = mounting if mounting is not None and mounting.turns_axes else None
         pad = _of(name, settings.pad)
-        check = None if settings.trust is None else PatternCheck(settings.trust, contract)
+        check = None if settings.trust is None else PatternCheck(settings.trust, contract, self.report)
         self.events: list[Untimed] = []
-        self.last = LastPattern(geometry.scan_shape, every_scan=options.every_scan)
+        self.last: LastPattern | None = None
         self.pad = SensorPad(
             contract, pad, _of(name, settings.counts_per_newton), check, _of(name, settings.scale_intervals)
         )
         self._name = name
         self._received_ns: int | None = None
-        self._checked, self._follows_drift = check is not None, options.follow_drift
+        self._check, self._options = check, options
         self.tracker = TapTracker(contract.taps, options, (geometry.rows, geometry.cols))
         self._health = Health((geometry.rows, geometry.cols), mounting, settings.estimator)
         notes = notes_on_missing(name, settings.mountings, settings.baselines)
         self._zeroing = Zeroing(self.tracker, self._health, mounting, self.report, settings.unix_time_s, notes)
         self._doubt = BaselineDoubt(options, geometry.taxel_count, self.report)
         self._taps = Taps(self.tracker, self._health, contract, options, self.report)
-        self._check = Check(check, self.tracker, self._health, self.report)
         self._describe = Describe(contract, settings.trust, geometry, self.pad)
         self.learn: Learn | None = None
         if settings.contacts is not None:
@@ -131,13 +130,13 @@ class Sensor:
             return
         self._doubt(step)
         self._taps(step, track)
-        if self._follows_drift:
+        if self._options.follow_drift:
             self._zeroing.follow_drift(step)
         if not step.contact and self.learn is not None and self.learn.waiting and self.learn.learn(self._health.dead):
-            self.last.estimate = None
+            self.last = None
         if step.doubted:
             step.notes = (*step.notes, *self._doubt.notes)
-        elif step.contact and not self._checked:
+        elif step.contact and self._check is None:
             step.notes = (*step.notes, UNCHECKED)
         step.gains_certainty, step.scale_error = self.pad.gains_certainty, self.pad.scale_error
         per_newton = self.pad.counts_per_newton
@@ -149,31 +148,34 @@ class Sensor:
     def begin(self, step: Step, due: Window) -> tuple[Estimate, NDArray[np.float32]]:
         """Return an estimate of the taps of a window that belong together, and the model's input for its pattern."""
         scaled = due.counts / self.pad.counts_per_unit
+        if due.poses is None:
+            scaled[due.taps :] = 0
+            return Estimate(due.taps, due.counts[: due.taps], None), scaled
         taps, belonging, dropped = list(range(due.taps)), None, None
-        if due.poses is not None and due.taps > 1 and self._checked and not step.doubted:
-            taps, belonging = self._check.belonging(step, due, scaled)
+        if due.taps > 1 and self._check is not None and not step.doubted:
+            taps, belonging = self._check.taps_of_contact(self.tracker, due, scaled, posed=step.pose is not None)
             dropped = due.taps - len(taps)
-        if due.poses is not None:
-            return Estimate(len(taps), due.counts[taps], due.poses[taps], belonging, dropped), scaled[taps]
-        scaled[due.taps :] = 0
-        return Estimate(due.taps, due.counts[: due.taps], None), scaled
+        return Estimate(len(taps), due.counts[taps], due.poses[taps], belonging, dropped), scaled[taps]
 
     def finish(self, step: Step, due: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
         """Pass a step through the stages after the model; the newest readings (3, rows, cols) are in network units."""
         step.estimate = made
-        self.last.keep(step, due, made)
+        self.last = None if self._options.every_scan else LastPattern(made, step.scan.number, due)
         if step.doubted:  # nothing follows from it, and nothing is learned
             made.traction = None
             return
         if made.deviation is not None and step.dead:
             made.deviation = made.deviation * self._health.widening
         about = None if made.pattern is None or made.deviation is None else doubt(made.pattern, made.deviation)
-        self._check(made, due.tap, newest, about)
+        if self._check is not None and made.pattern is not None:
+            made.trusted, made.untrusted_reason, made.mismatch = self._check.judge(
+                due.tap, newest, made.pattern, about[0] if about else None, made.traction, self._health.most_repeats
+            )
         self._describe(made, due.tap, newest, about)
         if self._taps.advice is not None:
             self._taps.advice.see(step, due.tap)
         if self.learn is not None and self.learn(step, made, due.counts[0], self._health.dead):
-            self.last.estimate = None  # it was made with other gains
+            self.last = None  # it was made with other gains
 
     def zero_again(self, *, force: bool) -> None:
         """Take a new baseline from the next scans, with an event for the outcome; `force` also in contact."""
@@ -186,7 +188,7 @@ class Sensor:
         a contact is believed again once the pad was seen at rest.
         """
         self.tracker.reset()
-        self.last.estimate = None
+        self.last = None
         self._health.forget()
         self._doubt.lose_touch()
         self._zeroing.lose_touch()
@@ -356,7 +358,7 @@ class Runtime:
         if overtaken is not None:
             overtaken[1].overtake()
             ready.append(overtaken[1].freeze())
-        if step.due is not None and not sensor.last.reuse(step, step.due):
+        if step.due is not None and not (sensor.last and sensor.last.reuse(step, step.due)):
             self.waiting[name] = sensor, step, step.due
             return ready
         if overtaken is not None:
@@ -388,11 +390,10 @@ class Runtime:
                 poses.append(made.poses)
         patterns = model.run_together(inputs, pads, *([poses] if poses else []))
         run_time_us = (self._clock_ns() - start_ns) / 1e3
-        deviations, tractions = model.deviation, model.traction
         for row, ((sensor, step, window), made) in enumerate(zip(due, begun, strict=True)):
             made.pattern, step.run_time_us = patterns[row], run_time_us
-            made.deviation = None if deviations is None else deviations[row]
-            made.traction = None if tractions is None else tractions[row]
+            made.deviation = None if model.deviation is None else model.deviation[row]
+            made.traction = None if model.traction is None else model.traction[row]
             sensor.finish(step, window, made, inputs[row][0])
         done_ns = None if clock_ns is None else clock_ns()
         return [step.freeze(done_ns) for _, step, _ in due]

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract
 from edge.inference.trust_model import Trust, contact_features, pose_tap_features
 from edge.perception.event import Report
-from edge.perception.result import Estimate, Reason, Step, Window, WrenchOrigin
+from edge.perception.result import Reason, Window, WrenchOrigin
 from edge.perception.tap_tracker import TapTracker
-from edge.perception.taxel_health import Health
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 from firmware_bridge.sensor_file.model import with_scale
@@ -48,10 +47,10 @@ class TrustVerdict(NamedTuple):
 
 
 class PatternCheck:
-    """Checks of one sensor's patterns, with what its contacts have shown so far."""
+    """Checks of one sensor's patterns and of the earlier taps that they are made from, with what its contacts show."""
 
-    def __init__(self, trust: Trust, contract: Contract) -> None:
-        self._trust = trust
+    def __init__(self, trust: Trust, contract: Contract, report: Report = lambda kind, detail="": None) -> None:
+        self._trust, self._report = trust, report
         self._constants, self._takes_gains = len(contract.pad_inputs), contract.takes_gains
         self._unit_counts = contract.counts_per_unit[2]
         self._deepest = 1.1 * contract.output_full_scale  # a little more than the deepest press in training
@@ -85,6 +84,28 @@ class PatternCheck:
         check, features = self._trust.tap, pose_tap_features(window[:taps], poses[:taps])
         return [_share(score - check.limit) for score in check.network(features)]
 
+    def taps_of_contact(
+        self, tracker: TapTracker, window: Window, scaled: NDArray[np.float32], *, posed: bool
+    ) -> tuple[list[int], tuple[float, ...]]:
+        """Return the numbers of the taps of a window that belong to the contact, and how little each earlier one does.
+
+        A press nearly as strong as an earlier one settles it, and the tracker forgets that tap; a lighter one may only
+        have begun. `scaled` is the window in network units, (K, 3, rows, cols), `posed` as in `foreign_taps`.
+        """
+        belonging = tuple(self.belonging(scaled, window.taps, window.poses))
+        dropped = foreign_taps(belonging, posed=posed)
+        forgotten = [
+            number
+            for number in (dropped if posed else dropped[:1])
+            if scaled[0, 2].sum() >= 0.85 * scaled[number, 2].sum()
+        ]
+        for number in forgotten:
+            self._report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")
+        if forgotten:
+            slots = window.slots
+            tracker.forget([slots[tap] for tap in forgotten] if posed else range(slots[forgotten[0]], sys.maxsize))
+        return [number for number in range(window.taps) if number not in dropped], belonging
+
     def judge(
         self,
         tap: int,
@@ -106,7 +127,10 @@ class PatternCheck:
             return TrustVerdict(False, "stuck") if repeats >= REPEATS else TrustVerdict(None)
         trust = self._trust
         (score,) = trust.contact.network(contact_features(newest, self._pad_row))
-        self._weigh(tap, strength, score)
+        if tap != self._tap:
+            self._begin_contact(tap)
+        if strength > self._strongest and math.isfinite(score):
+            self._strongest, self._score = strength, score
         mismatch, explained = None, True
         if traction is not None:
             mismatch = trust.forward.mismatch(self._operator, newest, pattern, traction, self._gain_error)
@@ -128,18 +152,18 @@ class PatternCheck:
             reason = "sensor"
         return TrustVerdict(reason is None, reason, mismatch)
 
-    def _weigh(self, tap: int, strength: float, score: float) -> None:
-        """Add the evidence of each contact once, by its strongest scan, when the next one begins."""
-        if tap != self._tap:
-            if self._tap is not None:
-                # A doubtful contact, up to 1.5, speaks for the sensor; none counts for more than 4.5 either way. So
-                # three clear faults in a row pass 12, and two to four good contacts lead from 12 to 20 below 6.
-                step = min(max(self._score - 1.5, -4.5), 4.5)
-                self._evidence = min(max(self._evidence + step, 0.0), 20.0)
-                self.suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
-            self._tap, self._strongest = tap, -math.inf
-        if strength > self._strongest and math.isfinite(score):
-            self._strongest, self._score = strength, score
+    def _begin_contact(self, tap: int) -> None:
+        """Add the evidence of the contact before, by its strongest scan."""
+        if self._tap is not None:
+            # A doubtful contact, up to 1.5, speaks for the sensor; none counts for more than 4.5 either way. So three
+            # clear faults in a row pass 12, and two to four good contacts lead from 12 to 20 below 6.
+            step = min(max(self._score - 1.5, -4.5), 4.5)
+            self._evidence = min(max(self._evidence + step, 0.0), 20.0)
+            suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
+            if suspected != self.suspected:
+                self.suspected = suspected
+                self._report("suspected" if suspected else "cleared")
+        self._tap, self._strongest = tap, -math.inf
 
 
 def foreign_taps(belonging: Sequence[float], *, posed: bool) -> list[int]:
@@ -171,56 +195,6 @@ def _share(log_odds: float) -> float:
     if math.isnan(log_odds):
         return 1.0
     return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))  # beyond 30 it is 0 or 1 to ten digits
-
-
-class Check:
-    """Stage: the checks of one sensor's patterns, and of the earlier taps that they are made from."""
-
-    def __init__(self, check: PatternCheck | None, taps: TapTracker, health: Health, report: Report) -> None:
-        self._check, self._taps, self._health, self._report = check, taps, health, report
-
-    def belonging(
-        self, step: Step, window: Window, scaled: NDArray[np.float32]
-    ) -> tuple[list[int], tuple[float, ...] | None]:
-        """Return the numbers of the taps of a window that belong to the contact, and the mismatch of each earlier one.
-
-        A press nearly as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have
-        begun. `scaled` is the window in network units, (K, 3, rows, cols).
-        """
-        every = list(range(window.taps))
-        if self._check is None:
-            return every, None
-        belonging = tuple(self._check.belonging(scaled, window.taps, window.poses))
-        posed = step.pose is not None
-        dropped = foreign_taps(belonging, posed=posed)
-        forgotten = [
-            number
-            for number in (dropped if posed else dropped[:1])
-            if scaled[0, 2].sum() >= 0.85 * scaled[number, 2].sum()
-        ]
-        for number in forgotten:
-            self._report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")
-        if forgotten:
-            slots = window.slots
-            self._taps.forget([slots[tap] for tap in forgotten] if posed else range(slots[forgotten[0]], sys.maxsize))
-        return [number for number in every if number not in dropped], belonging
-
-    def __call__(
-        self, made: Estimate, tap: int, newest: NDArray[np.float32], about: tuple[float, float] | None
-    ) -> None:
-        """Give the verdict on the estimate of a tap by its newest readings (3, rows, cols) in network units.
-
-        `about` is the pattern's doubt, and its RMS.
-        """
-        check = self._check
-        if check is None or made.pattern is None:
-            return
-        suspected = check.suspected
-        made.trusted, made.untrusted_reason, made.mismatch = check.judge(
-            tap, newest, made.pattern, None if about is None else about[0], made.traction, self._health.most_repeats
-        )
-        if check.suspected != suspected:
-            self._report("cleared" if suspected else "suspected")
 
 
 def _which(number: int, *, alone: bool) -> str:

@@ -67,25 +67,21 @@ class Cadence:
             return
         gap_ns = scan.on_bus_ns - before.on_bus_ns
         if gap_ns > 0 and (scan.device_ns is not None or not scan.unread_ns):  # those that waited came at no pace
-            self._add(gap_ns)
+            # Held up somewhere, it came right behind the one before; unless all of late did. Bursts of all sixteen
+            # frames, 16 ms apart, are further apart.
+            hurried = self.period_ns is not None and gap_ns * 8 < self.period_ns
+            self._hurried = self._hurried + 1 if hurried else 0
+            if self._hurried > LONGEST_BURST:
+                self._intervals.clear()
+                self.period_ns = self._stated_ns
+            if not 0 < self._hurried <= LONGEST_BURST:
+                self._intervals.append(gap_ns)
+                if self._stated_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
+                    self.period_ns = sorted(self._intervals)[len(self._intervals) // 2]
         period_ns = self.period_ns
         # Half of the fastest sensor's: scans that are nearer waited somewhere.
         if period_ns and period_ns >= 500_000 and (self._before_gap is not None or gap_ns > GAP_PERIODS * period_ns):
             self._follow_gap(before, scan, gap_ns, period_ns)
-
-    def _add(self, interval_ns: int) -> None:
-        # Held up somewhere, it came right behind the one before; unless all of late did. Bursts of all sixteen frames,
-        # 16 ms apart, are further apart.
-        hurried = self.period_ns is not None and interval_ns * 8 < self.period_ns
-        self._hurried = self._hurried + 1 if hurried else 0
-        if self._hurried > LONGEST_BURST:
-            self._intervals.clear()
-            self.period_ns = self._stated_ns
-        elif hurried:
-            return
-        self._intervals.append(interval_ns)
-        if self._stated_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
-            self.period_ns = sorted(self._intervals)[len(self._intervals) // 2]
 
     def _forget_pace(self, scan: Scan | None) -> None:
         self._before_gap: Scan | None = None  # scan before a gap whose missing ones are not counted yet

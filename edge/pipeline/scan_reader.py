@@ -269,7 +269,7 @@ class Source:
                 scans = reader.read(POLL_S)
             finally:  # its notices come also before its end
                 notices: list[Notice | TimedPose] = [*reader.notices()]
-                if link.kind != "device":  # recordings hold poses, and the demo's robot states some
+                if link.states_poses:
                     notices += link.poses()
                 if notices or scans:
                     self._put(notices, scans)

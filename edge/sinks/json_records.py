@@ -136,6 +136,7 @@ def pack(header: Mapping[str, Any], maps: Mapping[str, NDArray[np.floating]]) ->
 
 PIPE_BYTES: Final = 1 << 20  # most that Linux gives to any user
 _WITH_MAPS: Final = RecordForm(maps=True)
+_ON_A_LINE: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 
 
 class JsonLinesSink(Sink):
@@ -179,13 +180,14 @@ class JsonLinesSink(Sink):
         fields = self._form.of(result, self._turns.of(result, counters))
         if self._contract is not None:
             fields[CONTACTS] = _contacts(result, self._contract)
-        self._write(_line(fields))
+        self._write(fields)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Write a record of an event."""
-        self._write(_line(event_record(event, {**counters, "unwritten": self.unwritten}, self._source)))
+        self._write(event_record(event, {**counters, "unwritten": self.unwritten}, self._source))
 
-    def _write(self, line: bytes) -> None:
+    def _write(self, fields: Mapping[str, Any]) -> None:
+        line = orjson.dumps(fields, option=_ON_A_LINE)
         while self._may_be_full and not has_room(self._file.fileno(), len(line)):
             # In the pause less comes in than a pipe holds.
             if not self._waits or self._stop.wait(0.002):
@@ -211,11 +213,7 @@ class JsonLinesSink(Sink):
 
 def record_line(result: Result, counters: Mapping[str, int] | None) -> bytes:
     """Return a result as one line of JSON, its maps last."""
-    return _line(_WITH_MAPS.of(result, counters))
-
-
-def _line(fields: Mapping[str, Any]) -> bytes:
-    return orjson.dumps(fields, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
+    return orjson.dumps(_WITH_MAPS.of(result, counters), option=_ON_A_LINE)
 
 
 def _contacts(result: Result, contract: Contract) -> list[dict[str, Any]]:

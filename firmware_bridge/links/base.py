@@ -205,8 +205,7 @@ class LinkReader:
         self._give_up_s = give_up_s if link.lasts else 0.0
         self._clock_ns, self._sleep = clock_ns, sleep
         self._entered = False
-        self._trouble: str | None = None
-        self._stamps_dropped = False
+        self._reported: tuple[str | None, bool] = None, False  # its trouble, and whether its stamps are no clock
         self._notices: list[Notice] = []
         self._lost_ns: int | None = None  # beginning of an outage that has not ended
         self._silent = self._away = False
@@ -238,7 +237,8 @@ class LinkReader:
         except LinkLostError as error:
             self._lose(f"{error}")
             return []
-        self._report()
+        if (self.link.trouble, self.link.stamps_dropped) != self._reported:
+            self._report()
         if scans:
             if self._lost_ns is not None:
                 self._tell("back", f"{self.link.name} is back after {self._away_s():.1f} s")
@@ -267,12 +267,11 @@ class LinkReader:
 
     def _report(self) -> None:
         """Tell of a trouble that begins or ends, and of time stamps that are no clock."""
-        link = self.link
-        if link.trouble != self._trouble:
-            self._trouble = link.trouble
+        link, (trouble, dropped) = self.link, self._reported
+        self._reported = link.trouble, link.stamps_dropped
+        if link.trouble != trouble:
             self._tell("well" if link.trouble is None else "trouble", link.trouble or f"{link.name} reports no trouble")
-        if link.stamps_dropped and not self._stamps_dropped:
-            self._stamps_dropped = True
+        if link.stamps_dropped and not dropped:
             self._tell(
                 "note", f"{link.name}: its time stamps do not run as this machine's clock does, and are left out"
             )

@@ -210,7 +210,11 @@ class SlcanSerialLink(Link):
                 self._counts["received_bytes"] += len(data)
                 fed = self._scans.feed(data, time_ns)
             scans += self._unread.mark(fed, time_ns, self._scans.clock.begun_ns)
-        self._ask_in_silence(self._serial, bool(scans), pieces[-1][1])
+        now_ns, answers = pieces[-1][1], self._scans.decoder.status_answers
+        if scans or not self._scan_ns:
+            self._scan_ns, self._answers_at_scan, self._asked_ns, self.trouble = now_ns, answers, None, None
+        else:
+            self._ask_in_silence(self._serial, now_ns)
         if self._stamps_on and self._scans.clock.dropped:
             self.stamps_dropped = True
             self._asks_stamps = self._stamps_on = False
@@ -220,16 +224,13 @@ class SlcanSerialLink(Link):
             self._open_anew(self._serial, STAMPS_ON)
         return scans
 
-    def _ask_in_silence(self, port: serial.Serial, heard: bool, now_ns: int) -> None:
+    def _ask_in_silence(self, port: serial.Serial, now_ns: int) -> None:
         """Request the status flags where no scan comes, which they may explain: of any bus they hold an error at times.
 
         They are not requested while scans come: some adapters obey one command a USB packet, and the answer arrives
         among the frames.
         """
-        decoder = self._scans.decoder
-        if heard or not self._scan_ns:
-            self._scan_ns, self._answers_at_scan, self._asked_ns = now_ns, decoder.status_answers, None
-        asked_ns = self._asked_ns
+        decoder, asked_ns = self._scans.decoder, self._asked_ns
         if now_ns - self._scan_ns >= ADAPTER_ASKED_NS and (asked_ns is None or now_ns - asked_ns >= ASKED_AGAIN_NS):
             self._asked_ns = now_ns
             with suppress(*_PORT_ERRORS):  # an adapter that accepts no bytes would not answer either

@@ -13,8 +13,7 @@ from scipy import ndimage
 
 from edge.api import USPA44, Pad, Patch, PatchEvents, Result, find_model, load_model, patches
 from edge.inference.trust_model import features
-from edge.perception.pattern_description import Balance, wrench_of
-from edge.perception.result import LEAST_FORCE_N
+from edge.perception.pattern_description import LEAST_FORCE_N, Balance, wrench_of
 from edge.sinks.mcap import McapSink
 from edge.sinks.ros2.map_messages import recorded_map
 from edge.sinks.ros2.messages import GRID, WRENCH_STAMPED, force_and_torque

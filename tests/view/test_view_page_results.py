@@ -53,7 +53,7 @@ def red_share(page):
 
 def test_force_and_torque_are_told_and_drawn(open_page):
     contract = make_pad_contract(interval_factor=1.6)
-    wrench = Wrench((0.3, 0.0, 0.4), (-0.94, 0.94, -1.25), (-2.35, -2.35))
+    wrench = Wrench((0.3, 0.0, 0.4), (-0.94, 0.94, -1.25), (-2.35, -2.35), 0.75)
     made = replace(Press(contract=contract).next(), wrench=wrench)
     shows = [made]
     with live_page(contract=contract) as shown, shown.playing(lambda: shows[0]):
