@@ -17,19 +17,12 @@ from firmware_bridge.can import gs_usb
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError, as_typed
 from firmware_bridge.links.base import SourceKind, not_open
 from firmware_bridge.links.frame_link import FrameLink
+from firmware_bridge.links.known_adapters import GS_USB_ADAPTERS
 from firmware_bridge.links.serial_ports import Recognised, holders
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.frame_scans import GsUsbScans
 from firmware_bridge.scans.scan import Scan
 
-GS_USB_ADAPTERS: Final = {
-    (0x1D50, 0x606F): "candleLight",  # and most of its kin, CANable among them
-    (0x1209, 0x2323): "candleLight",
-    (0x1209, 0xCA01): "CANnectivity",
-    (0x1CD2, 0x606F): "CES CANext FD",
-    (0x16D0, 0x10B8): "ABE CANdebugger FD",
-}
-"""Adapters that are recognised, by their USB ids. Source: Linux drivers/net/can/usb/gs_usb.c, and CANnectivity."""
 INTERFACE: Final = 0
 CHANNEL: Final = 0
 ENDPOINT_IN: Final = 0x81

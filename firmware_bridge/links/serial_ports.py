@@ -11,14 +11,8 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from firmware_bridge.errors import NoDeviceError, as_typed
+from firmware_bridge.links.known_adapters import FTDI_X, SLCAN_ADAPTERS
 
-FTDI_X: Final = (0x0403, 0x6015)  # id of FTDI's chip, in the adapter that XELA ships, but also in grippers and cables
-SLCAN_ADAPTERS: Final = {
-    FTDI_X: "VScom USB-CAN Plus",
-    (0xAD50, 0x60C4): "CANable, slcan firmware",  # the id of CANtact, from which its firmware is derived
-    (0x16D0, 0x117E): "CANable 2, slcan firmware",
-}
-"""Adapters on a serial port, which speak slcan, by their USB ids, vendor and product."""
 LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
 NO_PERMISSION: Final = (
     "no permission: add the user to the group that owns it (often: sudo usermod -aG dialout $USER), log in again"
