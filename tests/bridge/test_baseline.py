@@ -171,16 +171,6 @@ def test_from_counts_takes_what_it_is_given():
     assert (baseline.sensor, baseline.scans, baseline.created_unix_s) == ("6", 20, 99.0)
 
 
-@pytest.mark.parametrize(
-    "counts", [still(20)[0], still(0), still(20) - 70_000, still(20) * 10, still(20) - REST - 9, still(20) * np.nan]
-)
-def test_from_counts_takes_no_other_counts_than_raw_ones(counts):
-    with pytest.raises(
-        BaselineRefusedError, match=r"^counts of sensor 4: .*, expected \(n, 3, rows, cols\), 0 to 65535"
-    ):
-        Baseline.from_counts("4", counts, 99.0)
-
-
 def test_a_taxel_given_up_has_no_rest_until_the_next_zeroing():
     counts = still(200)
     counts[:, :, 1, 1] = ABSENT

@@ -8,7 +8,7 @@ import pytest
 from cli_samples import write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_scan
 
-from edge.api import Stream, UsageError, infer, open_recording, open_runtime, paired
+from edge.api import Baseline, BaselineRefusedError, Stream, UsageError, infer, open_recording, open_runtime, paired
 
 PRESSES = [0] * 5 + [3000] * 5 + [0] * 5
 COUNTS = np.stack([make_scan(number, press_counts=press, noise=3).counts for number, press in enumerate(PRESSES)])
@@ -79,6 +79,16 @@ def test_arrays_of_floats_and_in_the_vendors_order_are_taken(counts, baseline):
 def test_an_array_of_something_else_is_refused(wrong, words):
     with pytest.raises(UsageError, match=words):
         infer(FakeModel(), **({"counts": COUNTS, "baseline": REST} | wrong))
+
+
+@pytest.mark.parametrize(
+    "counts", [COUNTS[0], COUNTS[:0], COUNTS - 70_000, COUNTS * 10, COUNTS - COUNTS[0] - 9, COUNTS * np.nan]
+)
+def test_a_baseline_is_made_of_raw_counts_alone(counts):
+    with pytest.raises(
+        BaselineRefusedError, match=r"^counts of sensor 4: .*, expected \(n, 3, rows, cols\), 0 to 65535"
+    ):
+        Baseline.from_counts("4", counts, 99.0)
 
 
 class Timed:
