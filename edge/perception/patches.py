@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract
 from edge.perception.pattern_description import touched
 from edge.perception.result import Result
+from edge.validation import check_positive
 
 PatchEventKind = Literal["begin", "move", "slip", "end"]
 
@@ -156,6 +157,9 @@ class PatchEvents:
     by `move_mm` from where it was when that was last reported; it slips where its shear over its normal force reaches
     `slip_ratio`, and again only after it has fallen to four fifths of it. Patterns that are not believed count for
     nothing.
+
+    Raises:
+        UsageError: a number is not positive.
     """
 
     def __init__(
@@ -167,6 +171,9 @@ class PatchEvents:
         reach_mm: float = 4.0,
         scans: int = 3,
     ) -> None:
+        limits = {"slip_ratio": slip_ratio, "move_mm": move_mm, "reach_mm": reach_mm, "scans": scans}
+        for name, limit in limits.items():  # one that is NaN would never be reached
+            check_positive(name, limit)
         self._contract, self._slip_ratio, self._move_mm = contract, slip_ratio, move_mm
         self._reach_mm, self._scans = reach_mm, scans
         self._followed: list[_Followed] = []

@@ -15,6 +15,7 @@ from functools import partial
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from edge.errors import UsageError
 from edge.pipeline.pose_queue import LONGEST_BYTES, PoseQueue, json_object
 from edge.terminal.stop_signals import handled
 from firmware_bridge.scans.scan import is_sensor_name
@@ -38,6 +39,14 @@ class Command:
     name: Literal["reset", "zero"]
     sensor: str | None = None
     force: bool = False
+
+    def __post_init__(self) -> None:
+        # Any other name would zero: unlike a reset, a zeroing cannot be undone.
+        sensor_named = self.sensor is None or (isinstance(self.sensor, str) and is_sensor_name(self.sensor))
+        if self.name not in ("reset", "zero") or not sensor_named or not isinstance(self.force, bool):
+            raise UsageError(
+                f"{self}, expected 'reset' or 'zero', a sensor's name as text, such as '4', and True or False"
+            )
 
     def carry_out(self, runtime: "Runtime") -> None:
         """Ask it of a runtime."""
@@ -151,14 +160,13 @@ def runtime_command(parsed: Mapping[str, Any]) -> Command | None:
     """Return the command to the runtime that parsed JSON stands for; None if it is not one."""
     if parsed.get("cmd") == "reset":
         return RESET
-    sensor, force = parsed.get("sensor"), parsed.get("force", False)
-    # A misspelt key must not turn "zero sensor 4" into "zero all": unlike a reset, a zeroing cannot be undone.
+    # A misspelt key must not turn "zero sensor 4" into "zero all".
     if parsed.get("cmd") != "zero" or parsed.keys() - {"cmd", "sensor", "force"}:
         return None
     # A name that no sensor can have is neither looked up nor shown: a stranger may have written it.
-    if not (sensor is None or (isinstance(sensor, str) and is_sensor_name(sensor))) or not isinstance(force, bool):
-        return None
-    return Command("zero", sensor, force)
+    with suppress(UsageError):
+        return Command("zero", parsed.get("sensor"), parsed.get("force", False))
+    return None
 
 
 @contextmanager

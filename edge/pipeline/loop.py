@@ -230,6 +230,8 @@ class Loop:
         The sensors of a link send their scans in turn: once one has sent many, all have sent some.
         """
         heard = self.statistics.scans_of_each()
+        if not isinstance(name, str):
+            return f"no sensor {name!r}: a name is text, such as '4'"
         if name in heard or name in self._runtime.expected:
             return None
         prefix = max((prefix for prefix in self._source.prefixes if name.startswith(prefix)), key=len, default=None)

@@ -114,8 +114,7 @@ def free_baselines(
     """Return the baselines of sensors that have none in `known`, from where the recordings are free and still.
 
     The replay gets a note for each sensor. `mountings` are those of taxels that still have to be put in place. With
-    `opening` the first scans count, too, from which a live run would zero by itself: for baselines that are kept, whose
-    date is one that the recording states.
+    `opening` the first scans count, too, from which a live run would zero by itself: for baselines that are kept.
     """
     baselines: dict[str, Baseline] = {}
     for recording in replay.recordings:
@@ -146,9 +145,10 @@ def free_baselines(
             )
             if raw and name in mountings:
                 stretch = stretch._replace(counts=mountings[name].place_counts(stretch.counts))
-            created_s = (replay.first_ns + int(at_ns[1]) + (recording.unix_offset_ns or 0)) / 1e9
-            undated = opening and not recording.unix_offset_ns
-            baselines[name] = stretch.baseline(name, math.nan if undated else created_s)
+            created_s = math.nan
+            if recording.unix_offset_ns and track.time_ns is not None:  # 0: the time of recording was unknown even then
+                created_s = (int(track.time_ns[last]) + recording.unix_offset_ns) / 1e9
+            baselines[name] = stretch.baseline(name, created_s)
     return baselines
 
 

@@ -78,6 +78,8 @@ def open_runtime(
             the model takes.
     """
     chosen = RuntimeOptions(**options)
+    if not isinstance(source, Source):
+        raise UsageError(f"source is {source!r}, expected an open one: with open_source(...) as source")
     sensor_file, nominal = source.sensor_file, source.sensor_file.geometry == USPA44
     return Runtime(
         load_model(model) if isinstance(model, (str, Path)) else model,
@@ -121,7 +123,7 @@ def infer(
     if (scans != readings).any():
         raise UsageError("counts are not whole numbers, expected raw counts: no means, and nothing subtracted")
     if not isinstance(baseline, Baseline):
-        baseline = Baseline.from_counts("array", _checked("baseline", baseline, lowest=0), 0.0)
+        baseline = Baseline.from_counts("array", _checked("counts of the baseline", baseline, lowest=0), 0.0)
     recording = Recording(Path("array"), (Track(baseline.sensor, scans, None),), rate_hz)
     sensor_file = sensor_settings(None, unmapped(pad_of(*scans.shape[2:])))
     sensor_file = replace(sensor_file, sensors={baseline.sensor: SensorEntry(baseline=baseline)})
@@ -132,8 +134,8 @@ def infer(
 def _checked(name: str, counts: Any, *, lowest: int) -> NDArray[Any]:
     """Return counts as (n, 3, rows, cols); those in the vendor's order have the axes of each taxel together."""
     array = np.asarray(counts)
-    if array.dtype.kind not in "iuf":
-        raise UsageError(f"{name} are of type {array.dtype}, expected numbers: raw counts, nothing subtracted")
+    if array.dtype.kind not in "iuf" or array.dtype == np.float16:  # which holds counts to within 32
+        raise UsageError(f"{name} are of type {array.dtype}, expected whole numbers: raw counts, nothing subtracted")
     if not np.isfinite(array).all():
         raise UsageError(f"{name} hold NaN or infinity, expected raw counts: -1 where a taxel gave no reading")
     if array.ndim in (1, 2) and array.shape[-1] == GAINS:

@@ -294,8 +294,7 @@ class Source:
 
 
 def _one_kind(links: Sequence[Link]) -> SourceKind:
-    kinds: set[SourceKind] = {link.kind for link in links}
-    if len(kinds) != 1:
-        listed = ", ".join(f"{link.name} is {link.kind}" for link in links)
+    if len({(link.kind, link.origin == "emulated") for link in links}) != 1:
+        listed = ", ".join(f"{link.name} is {link.kind}{' (EMULATED)' * (link.origin == 'emulated')}" for link in links)
         raise SourceError(f"sources are of several kinds ({listed}), expected one: run them apart")
-    return kinds.pop()
+    return links[0].kind

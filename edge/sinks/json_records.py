@@ -137,6 +137,7 @@ def pack(header: Mapping[str, Any], maps: Mapping[str, NDArray[np.floating]]) ->
 PIPE_BYTES: Final = 1 << 20  # most that Linux gives to any user
 _WITH_MAPS: Final = RecordForm(maps=True)
 _ON_A_LINE: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
+_BEGINNING: Final = b'{"time_ns":'  # of every record: a recording, or a sensor file, must not become one by a slip
 
 
 class JsonLinesSink(Sink):
@@ -155,7 +156,7 @@ class JsonLinesSink(Sink):
         stop: threading.Event | None = None,
         fields: str | None = None,
     ) -> None:
-        """Open the target; a file that exists is replaced. Readers of a recording's records are waited for."""
+        """Open the target; an older file of records is replaced. Readers of a recording's records are waited for."""
         self._target = "stdout" if target == "-" else target
         self._source, self._stop, self._waits = source.kind, stop or threading.Event(), source.kind == "replay"
         names = None if fields is None else chosen_fields(fields)
@@ -255,7 +256,13 @@ def _open(target: str) -> FileIO:
         return FileIO(os.dup(sys.stdout.fileno()), "wb")
     path = Path(target)
     if not path.is_fifo():
-        return FileIO(path, "wb")
+        file = FileIO(path, "ab+")
+        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            file.seek(0)
+            if file.read(len(_BEGINNING)) not in (b"", _BEGINNING):
+                raise OSError(errno.EEXIST, "it holds something else: give another name, or delete it first")
+            file.truncate(0)
+        return file
     descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)  # a blocking open would wait for a reader
     os.set_blocking(descriptor, True)
     return FileIO(descriptor, "wb")

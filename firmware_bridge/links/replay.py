@@ -51,7 +51,8 @@ class ReplayLink(Link):
 
         Raises:
             RecordingError: a file cannot be used.
-            SourceError: the rate is invalid, a file has neither times nor a rate, or two files name the same sensor.
+            SourceError: the rate is invalid, a file has neither times nor a rate, two files name the same sensor, or
+                some are of emulated sensors and some are not.
         """
         if rate_hz is not None and not 0 < rate_hz < math.inf:
             raise SourceError(f"rate is {rate_hz} Hz, expected a positive number")
@@ -59,6 +60,10 @@ class ReplayLink(Link):
         timed = [file.path for file in self.recordings for track in file.tracks if track.time_ns is not None]
         if not paced and rate_hz is not None and timed:
             raise SourceError(f"{timed[0]} has times of its own, which are kept: leave out --rate-hz, or add --paced")
+        emulated = {str(file.path): file.origin == "emulated" for file in self.recordings}
+        if len(set(emulated.values())) > 1:
+            listed = ", ".join(f"{path} is {'emulated' if is_so else 'not'}" for path, is_so in emulated.items())
+            raise SourceError(f"recordings are of several kinds ({listed}), expected one: play them apart")
         self.name = harmless(f"replay:{','.join(str(file.path) for file in self.recordings)}")
         self.kind: SourceKind = "replay"
         self.lasts = False

@@ -24,6 +24,7 @@ from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
 CSV_POSES: Final = ("pose_x_mm", "pose_y_mm", "pose_turn_deg")
 EMULATED: Final = "emulated"  # column of a recording of an emulated sensor, whatever its cells are
 _TAXEL: Final = re.compile(r"(?P<force>force[ _])?(?:txl|taxel)?[ _]?0*(?P<taxel>[1-9][0-9]?)[ _]?(?P<axis>[xyz])")
+_SENSORS: Final = {"sensor", "sensor_id", "sensor id", "sensor_name", "sensor name"}
 _TIMES: Final = {"t", "time", "times", "timestamp", "timestamps", "stamp", "datetime", "clock", "epoch", "elapsed"}
 _UNITS: Final = {
     word: per_second
@@ -150,6 +151,7 @@ class _Scans:
         self._newton_columns = [newtons[key] for key in sorted(wanted)] if newtons.keys() == wanted else []
         self._pose_columns = [others[name] for name in CSV_POSES if name in others]
         self._emulated = EMULATED in others
+        self._sensor_columns = [others[name] for name in others if name.lower() in _SENSORS]
         self._left_out = [name for name in others if name not in (*CSV_POSES, EMULATED)]
         self._width = max(place + 1 for place, name in enumerate(header) if name)
         self._counts = array("i")
@@ -163,6 +165,10 @@ class _Scans:
         """Take one row; a _DamageError where it is damaged."""
         cells = row.cells
         _check_whole(row, self._width, self._before)
+        for column in self._sensor_columns if self._before else ():
+            if cells[column] != self._before[column]:
+                both = f"sensor '{cells[column][:20]}' after '{self._before[column][:20]}'"
+                raise ValueError(f"{both}, expected one sensor: cut the file in one for each")
         self._counts.extend(_count(cells[column]) for column in self._count_columns)
         self._newtons.extend(_number(cells[column]) for column in self._newton_columns)
         if any(cells[column] for column in self._pose_columns):

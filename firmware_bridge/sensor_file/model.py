@@ -222,11 +222,7 @@ def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
     taken = {key: table.take(key, read, required=False) for key, read in readers.items()}
     table.end()
     values = {key: value for key, value in taken.items() if value is not None}
-    if "counts_per_newton_interval" in values:
-        low, high = values["counts_per_newton_interval"]
-        if not low <= values.get("counts_per_newton", math.nan) <= high:
-            given = f"{[low, high]} of {values.get('counts_per_newton', 'no counts_per_newton')}"
-            table.refuse("counts_per_newton_interval", given, "an interval around counts_per_newton")
+    _check_around(table, "counts_per_newton", values, values.get("counts_per_newton_interval"))
     mounting = {key: values.pop(key) for key in ("order", "swap_xy", "signs", "gains") if key in values}
     for key, read in parts.items():
         if key in values:
@@ -249,7 +245,18 @@ def _pad(table: Table, sensor: str, geometry: SensorGeometry) -> Pad:
     if places["gains"] is None and places["gain_half_widths"] is not None:
         table.refuse("gain_half_widths", "without gains", "both, or none")
     stated = {name: ends for name, ends in intervals.items() if ends is not None}
+    for name, ends in stated.items():
+        _check_around(table, name, constants, ends)
     return Pad(**constants, intervals=stated, **places)
+
+
+def _check_around(
+    table: Table, name: str, values: Mapping[str, float | None], ends: tuple[float, float] | None
+) -> None:
+    value = values.get(name)
+    if ends is not None and not (value is not None and ends[0] <= value <= ends[1]):
+        given = f"{list(ends)} of {f'no {name}' if value is None else value}"
+        table.refuse(f"{name}_interval", given, f"an interval around {name}")
 
 
 def _frame(table: Table, sensor: str, geometry: SensorGeometry) -> PadFrame:

@@ -80,7 +80,15 @@ class Baseline:
 
     @classmethod
     def from_counts(cls, sensor: str, counts: NDArray[np.integer], created_unix_s: float) -> Self:
-        """Return the median of scans (n, 3, rows, cols), n > 0, whole ones, of a pad that was free and still."""
+        """Return the median of scans (n, 3, rows, cols), n > 0, whole ones, of a pad that was free and still.
+
+        Raises:
+            BaselineRefusedError: they are of another shape, or a count is beyond 0..65535, as of an absent taxel.
+        """
+        if counts.ndim != 4 or not counts.size or not 0 <= counts.min() <= counts.max() < COUNTS_ON_CIRCLE:
+            got = f"shape {counts.shape}, {counts.min():g} to {counts.max():g}" if counts.size else "none"
+            expected = f"(n, 3, rows, cols), 0 to {COUNTS_ON_CIRCLE - 1}, nothing subtracted"
+            raise BaselineRefusedError(f"counts of sensor {sensor}: {got}, expected {expected}")
         median = counts[0] + np.median(unwrapped(counts), axis=0)
         return cls.of(sensor, median % COUNTS_ON_CIRCLE, created_unix_s, len(counts), "start-up")
 

@@ -129,12 +129,14 @@ def test_torn_and_repeated_scans_are_told(tmp_path):
             {"rate_hz": 100, "paced": False},
             r"timed\.npz has times of its own.*leave out --rate-hz, or add --paced",
         ),
+        (["finger.csv", "emulated.npz"], {"rate_hz": 10}, r"finger\.csv is not, .*emulated\.npz is emulated"),
         (["gone.csv"], {}, "cannot be read"),
     ],
 )
 def test_recordings_that_cannot_be_replayed(tmp_path, names, options, words):
     write_recording(tmp_path / "finger.csv", make_counts(2))
     write_npz(tmp_path / "timed.npz", make_counts(1), [5])
+    write_npz(tmp_path / "emulated.npz", make_counts(1), origin=np.array(["emulated"]))
     with pytest.raises(RecordingError if names == ["gone.csv"] else SourceError, match=words):
         ReplayLink([tmp_path / name for name in names], **options)
 

@@ -92,6 +92,11 @@ def test_a_cell_of_a_csv_is_a_whole_number_of_sixteen_bits(tmp_path, written, re
         (HEADER.replace("txl16_z", "txl16_y") + row(0), 1, "two columns 'txl16_y'"),
         (HEADER.strip() + ",pose_x\n" + row(0).strip() + ",1\n", 1, "pose_x_mm"),
         (HEADER + row(0).strip() + ",1\n", 2, "49 columns"),
+        (
+            "Sensor," + HEADER + "4," + row(0) + "4," + row(1) + "6," + row(0),
+            4,
+            "sensor '6' after '4', expected one sensor",
+        ),
         (HEADER + '"1\n', 2, "not CSV"),
         (HEADER.encode("utf-16-le") + row(0).encode("utf-16-le"), 1, "txl1_x"),
     ],

@@ -8,7 +8,7 @@ import pytest
 from cli_samples import write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_scan
 
-from edge.api import Stream, UsageError, infer, open_recording, open_runtime, paired
+from edge.api import Baseline, BaselineRefusedError, Stream, UsageError, infer, open_recording, open_runtime, paired
 
 PRESSES = [0] * 5 + [3000] * 5 + [0] * 5
 COUNTS = np.stack([make_scan(number, press_counts=press, noise=3).counts for number, press in enumerate(PRESSES)])
@@ -61,13 +61,17 @@ def test_arrays_of_floats_and_in_the_vendors_order_are_taken(counts, baseline):
             {"counts": COUNTS + 0.5},
             "counts are not whole numbers, expected raw counts: no means",
         ),
-        ({"counts": COUNTS.astype(str)}, "counts are of type <U.*, expected numbers: raw counts, nothing subtracted"),
-        ({"baseline": np.full((3, 4, 4), np.nan)}, "baseline hold NaN or infinity, expected raw counts"),
+        (
+            {"counts": COUNTS.astype(str)},
+            "counts are of type <U.*, expected whole numbers: raw counts, nothing subtracted",
+        ),
+        ({"counts": COUNTS.astype(np.float16)}, "counts are of type float16, expected whole numbers"),
+        ({"baseline": np.full((3, 4, 4), np.nan)}, "counts of the baseline hold NaN or infinity, expected raw counts"),
         ({"counts": COUNTS[:, :2]}, r"counts have shape \(15, 2, 4, 4\), expected \(3, rows, cols\) or \(n, 3, rows"),
         ({"counts": COUNTS[:0]}, r"counts have shape \(0, 3, 4, 4\), expected"),
         ({"counts": COUNTS - 70_000}, "counts are -.*, expected -1 to 65535"),
         ({"counts": np.zeros((3, 9, 9), dtype=int)}, "counts have 81 taxels, expected at most 64"),
-        ({"baseline": np.full((3, 4, 4), -1)}, "baseline are -1 to -1, expected 0 to 65535"),
+        ({"baseline": np.full((3, 4, 4), -1)}, "counts of the baseline are -1 to -1, expected 0 to 65535"),
         ({"baseline": REST[:, :2]}, r"baseline of sensor array has shape \(3, 2, 4\), expected \(3, 4, 4\)"),
         ({"rate_hz": 0}, "rate_hz is 0, expected a positive number"),
     ],
@@ -75,6 +79,16 @@ def test_arrays_of_floats_and_in_the_vendors_order_are_taken(counts, baseline):
 def test_an_array_of_something_else_is_refused(wrong, words):
     with pytest.raises(UsageError, match=words):
         infer(FakeModel(), **({"counts": COUNTS, "baseline": REST} | wrong))
+
+
+@pytest.mark.parametrize(
+    "counts", [COUNTS[0], COUNTS[:0], COUNTS - 70_000, COUNTS * 10, COUNTS - COUNTS[0] - 9, COUNTS * np.nan]
+)
+def test_a_baseline_is_made_of_raw_counts_alone(counts):
+    with pytest.raises(
+        BaselineRefusedError, match=r"^counts of sensor 4: .*, expected \(n, 3, rows, cols\), 0 to 65535"
+    ):
+        Baseline.from_counts("4", counts, 99.0)
 
 
 class Timed:

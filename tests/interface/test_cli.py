@@ -186,6 +186,15 @@ def test_of_a_recording_a_few_free_scans_are_enough(tmp_path):
     assert np.abs(free.counts - zero.counts).max() < 5
 
 
+@pytest.mark.parametrize("paced", [[], ["--paced"]])
+def test_a_baseline_of_a_recording_without_a_date_has_no_age(files, tmp_path, paced):
+    """It begins in contact, so that its baseline is taken beforehand."""
+    path = write_recording(tmp_path / "held.npz", [3000] * 50 + [0] * 40)
+    done = run("replay", path, *paced, "--model", files / "tiny.onnx", "--sink", "jsonl:-")
+    got = [one for one in records(done.stdout) if one["state"] != "event"]
+    assert {(one["baseline_origin"], one["baseline_age_s"]) for one in got} == {("recording", None)}
+
+
 def test_the_baseline_of_a_pad_that_may_be_held_is_in_doubt(tmp_path):
     done = run("replay", write_recording(tmp_path / "held.npz", [*[400] * 60, *[0] * 110]))
     assert "sensor 4 has no pattern to be believed: baseline in doubt: taken from this recording" in done.stderr

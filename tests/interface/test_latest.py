@@ -272,11 +272,19 @@ def test_an_unknown_name_is_refused_once_its_link_was_heard():
         for call in (stream.latest, stream.read, lambda name: stream.pose(0, 0, sensor=name)):
             with pytest.raises(UsageError, match=r"^no sensor 'a/5': sensors are a/4$"):
                 call("a/5")
+            with pytest.raises(UsageError, match=r"^no sensor 5: a name is text, such as '4'$"):
+                call(5)
         for name in ("a/8", "b/4", "b/5"):
             assert stream.latest(name).result is None
         right.let(0)
         with pytest.raises(UsageError, match="no sensor 'a/5'"):
             next(paired(stream, ["a/4", "a/5"]))
+
+
+@pytest.mark.parametrize("wrong", [("Reset",), ("zero", 4), ("zero", "4", 1), ("zero", "")])
+def test_a_command_that_is_none_zeroes_nothing(wrong):
+    with pytest.raises(UsageError, match=r"^Command\(name=.*, expected 'reset' or 'zero', a sensor's name as text"):
+        Command(*wrong)
 
 
 def test_a_command_to_a_missing_sensor_is_refused_in_a_line():

@@ -74,6 +74,10 @@ class TestOpening:
             Source(FakeLink([]), FakeLink([], kind="emulated"))
         with pytest.raises(SourceError, match="of several kinds"):
             Source(Late([]), FakeLink([])).open()
+        played = FakeLink([], kind="replay")
+        played.origin = "emulated"
+        with pytest.raises(SourceError, match=r"\(fake is replay \(EMULATED\), fake is replay\), expected one"):
+            Source(played, FakeLink([], kind="replay"))
         with Source(Late([]), Late([], prefix="b/")) as source:
             assert source.kind == "emulated"
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
 from scipy import ndimage
 
-from edge.api import USPA44, Pad, Patch, PatchEvents, Result, find_model, load_model, patches
+from edge.api import USPA44, Pad, Patch, PatchEvents, Result, UsageError, find_model, load_model, patches
 from edge.inference.trust_model import features
 from edge.perception.pattern_description import LEAST_FORCE_N, Balance, wrench_of
 from edge.sinks.mcap import McapSink
@@ -230,6 +230,12 @@ def test_a_contact_begins_moves_and_ends_once():
     assert told(events, lost) == []
     assert told(events, [free] * 3) == [("end", 1), ("end", 2)] and told(events, [free] * 3) == []
     assert told(events, [held, free, held, free, held]) == [], "a flicker is no contact"
+
+
+@pytest.mark.parametrize("limit", [{"slip_ratio": float("nan")}, {"move_mm": -1.0}, {"reach_mm": 0}, {"scans": None}])
+def test_a_limit_that_is_never_reached_is_refused(limit):
+    with pytest.raises(UsageError, match="expected a positive number"):
+        PatchEvents(CONTRACT, **limit)
 
 
 def test_a_slip_is_told_once_until_it_has_stuck_again():

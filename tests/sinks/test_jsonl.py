@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sink_samples import CONTRACT, RUN, make_results, make_sure_results
 
-from edge.api import Event, Runtime
+from edge.api import Event, Runtime, SinkError
 from edge.sinks.json_records import ALWAYS, has_room, pack, record_line
 from edge.sinks.registry import open_sink
 from firmware_bridge.scans.scan import VendorReading
@@ -30,13 +30,22 @@ class TestJsonLines:
         results = [runtime.push(make_scan(n, press_counts=z, sensor=name)) for n, (z, name) in enumerate(presses)]
         assert [result.reused_from for result in results] == [None, None, 0, 1, None, None, None, 6]
         path = tmp_path / "out.jsonl"
-        path.write_text("old\n")
+        path.write_text('{"time_ns":5,"sensor":"old"}\n')
         sink, expected = open_sink(f"jsonl:{path}", CONTRACT, fake_source()), b""
         for number, result in enumerate(results):
             sink.write(result, RUN)
             expected += record_line(result, None if number > 1 else RUN | {"unwritten": 0})  # the first of each sensor
             assert path.read_bytes() == expected, "there as soon as it is written"
         sink.close()
+
+    @pytest.mark.parametrize("content", [b"txl1_x,txl1_y\n", b'{\n  "format": "tactile-baseline"', b"\x89MCAP", b"{"])
+    def test_what_holds_no_records_is_not_replaced(self, tmp_path, content):
+        """As of `edge-sr replay press.csv --sink jsonl:press.csv`, which left no recording."""
+        path = tmp_path / "press.csv"
+        path.write_bytes(content)
+        with pytest.raises(SinkError, match=r"press\.csv: it holds something else: give another name"):
+            open_sink(f"jsonl:{path}", CONTRACT, fake_source())
+        assert path.read_bytes() == content
 
     @pytest.mark.parametrize(
         ("chosen", "more"),
