@@ -102,7 +102,7 @@ def test_keys_of_baseline_and_sensor_files(tmp_path):
     assert set(document) == {"format", "version", "baselines"}
     assert set(document["baselines"][0]) == told("Baseline file")
     constants = {name: low or high for name, (low, high) in PAD_RANGES.items()}
-    pad = Pad(**constants, intervals={"thickness_mm": (4, 5)}, gains=(1.0,) * GAINS, gain_half_widths=(0.1,) * GAINS)
+    pad = Pad(**constants, intervals={"thickness_mm": (0.1, 5)}, gains=(1.0,) * GAINS, gain_half_widths=(0.1,) * GAINS)
     marks = {"assumed": frozenset({"mounting"}), "emulated": frozenset({"force"})}
     marks |= {"counts_per_newton_interval": (1100.0, 1260.0)}
     sensors = {"4": SensorEntry(Mounting(swap_xy=True), 1180.0, baseline, pad, pad, **marks)}

@@ -37,6 +37,7 @@ _SENSORS: Final = 10
 _CONTACTS: Final = 200
 _BALL_MM: Final = 40.0
 _BALL_PRESSES: Final = 16
+_RISING: Final = 6  # scans of a press
 _LEFT_COUNTS: Final = 5.0  # of drift, where the pad was free just before a press
 _JUDGED: Final = 240  # presses of a sensor, of each kind, on which models are evaluated
 _SEED: Final = 8_300_001
@@ -126,23 +127,30 @@ def _sensors(bench: Workbench) -> Iterator[BlindSensor]:
         true_gains = tuple((gains / scale).ravel().tolist())
         weighed = Weighed(true["counts_per_newton"] * rng.normal(1, COVERED_ERROR / LEVEL_90), COVERED_ERROR)
         found = with_scale(learned(contacts, model).pad(), weighed.counts_per_newton, weighed.interval) or SensorPad()
-        by_ball = fit_ball(list(_ball_presses(pad, chips, rng, number)[:, None]), _BALL_MM, found)
+        by_ball = fit_ball(_ball_presses(pad, chips, rng, number), _BALL_MM, found)
         by_ball = replace(by_ball, gains=found.gains, gain_half_widths=found.gain_half_widths)
         known = knowledge_of(SensorFile(sensors={str(number): SensorEntry(pad=by_ball)}), None)
         truth = SensorPad(**true, intervals={}, gains=true_gains, gain_half_widths=(0.0,) * GAINS)
         yield BlindSensor(number, chips, truth, known, found)
 
 
-def _ball_presses(pad: Pad, chips: NDArray[np.float32], rng: np.random.Generator, number: int) -> NDArray[np.float32]:
-    """Return what a sensor reads when a ball is pressed onto it by hand, (n, 3, rows, cols)."""
+def _ball_presses(
+    pad: Pad, chips: NDArray[np.float32], rng: np.random.Generator, number: int
+) -> list[NDArray[np.float32]]:
+    """Return the scans of a sensor, (_RISING, 3, rows, cols), in each press of a ball by hand."""
     gripped, n, way = GrippedPad(pad), _BALL_PRESSES, rng.uniform(0, 2 * np.pi, _BALL_PRESSES)
     x, y = gripped.places_mm
     at = rng.uniform(-4, 4, (2, n, 1, 1))
     heights = np.sqrt((_BALL_MM / 2) ** 2 - np.square(x - at[0]) - np.square(y - at[1])) - _BALL_MM / 2
     slide = log_uniform(rng, 0.02, 0.3, (n, 1)) * np.stack([np.cos(way), np.sin(way)], axis=1)
     depths, twists, friction = rng.uniform(0.1, MAX_INDENTATION_MM, n), rng.normal(0, 0.02, n), rng.uniform(0.2, 1.2, n)
-    done = gripped.press(heights.astype(np.float32), depths, slide, twists, friction, [BARE] * n)
-    return _felt(done.counts, chips, number, Nuisances(thermal_drift_counts=_LEFT_COUNTS, earth_field_counts=0.0))
+    every, share = np.repeat(np.arange(n), _RISING), np.tile(np.arange(1, _RISING + 1) / _RISING, n)
+    moved = (part[every].T * share for part in (depths, slide, twists))
+    done = gripped.press(
+        heights.astype(np.float32)[every], *(part.T for part in moved), friction[every], [BARE] * len(every)
+    )
+    read = _felt(done.counts, chips, number, Nuisances(thermal_drift_counts=_LEFT_COUNTS, earth_field_counts=0.0))
+    return np.split(read, n)
 
 
 def _felt(

@@ -1,9 +1,9 @@
 """Constants of a pad and gains of its channels, from presses of a ball whose size is known.
 
-Where the shape is known, readings of light and firm presses determine thickness, Poisson's ratio, in-plane share, magnet
-height and free sides; the modulus hardly. The
-simulated sensor's readings are fitted to those of all presses at once, by least squares: unknown are the constants,
-cross-talk and gains, and of each press its place, depth, drag, friction and lag, and what is left of drift.
+Where the shape is known, readings of light and firm presses determine thickness, Poisson's ratio, in-plane share,
+magnet height and free sides; the modulus hardly. The simulated sensor's readings are fitted to those of all presses at
+once, by least squares: unknown are the constants, cross-talk and gains, and of each press its place, depth, drag,
+friction and lag, and what is left of drift.
 """
 
 from collections.abc import Sequence
