@@ -145,9 +145,13 @@ def _ball_presses(
     slide = log_uniform(rng, 0.02, 0.3, (n, 1)) * np.stack([np.cos(way), np.sin(way)], axis=1)
     depths, twists, friction = rng.uniform(0.1, MAX_INDENTATION_MM, n), rng.normal(0, 0.02, n), rng.uniform(0.2, 1.2, n)
     every, share = np.repeat(np.arange(n), _RISING), np.tile(np.arange(1, _RISING + 1) / _RISING, n)
-    moved = (part[every].T * share for part in (depths, slide, twists))
     done = gripped.press(
-        heights.astype(np.float32)[every], *(part.T for part in moved), friction[every], [BARE] * len(every)
+        heights.astype(np.float32)[every],
+        depths[every] * share,
+        slide[every] * share[:, None],
+        twists[every] * share,
+        friction[every],
+        [BARE] * len(every),
     )
     read = _felt(done.counts, chips, number, Nuisances(thermal_drift_counts=_LEFT_COUNTS, earth_field_counts=0.0))
     return np.split(read, n)
