@@ -246,7 +246,8 @@ def _pad(table: Table, sensor: str, geometry: SensorGeometry) -> Pad:
         table.refuse("gain_half_widths", "without gains", "both, or none")
     stated = {name: ends for name, ends in intervals.items() if ends is not None}
     for name, ends in stated.items():
-        _check_around(table, name, constants, ends)
+        if constants[name] is not None:
+            _check_around(table, name, constants, ends)
     return Pad(**constants, intervals=stated, **places)
 
 

@@ -165,7 +165,6 @@ OF_GAINS, PLACE = f"gains = {[1.0] * 48}\n", "place_mm = [0, 0, 0]\n"
         (PAD + "in_plane_share_interval = 1", "two numbers from 0 to 10, the lower first"),
         (PAD + "in_plane_share_interval = [2, 1]", "the lower first"),
         (PAD + "in_plane_share = 0.2\nin_plane_share_interval = [0.3, 0.4]", "an interval around in_plane_share"),
-        (PAD + "pitch_mm_interval = [4, 5]", "of no pitch_mm, expected an interval around pitch_mm"),
         (PAD + "in_plane_share_interval = [1, 2, 3]", "two numbers"),
         (PAD + "gains_interval = [1, 2]", "'sensors.4.pad.gains_interval': not known"),
         (PAD + "gains = [1, 1, 1]", "48 numbers from 0.01 to 100: x of all places, then y, then z"),
