@@ -1,12 +1,12 @@
 """Identify a sensor from its own recordings: the gains of its channels, and constants of its pad.
 
     python -m train.identify recordings --out sensor.toml
-    python -m train.identify ball.csv --ball-mm 40 --out sensor.toml
+    python -m train.identify ball.mcap --ball-mm 40 --out sensor.toml
 
 RECORDINGS is a folder of TRIAL/xela_SENSOR.csv; one trial has to end with a free pad, from which all are zeroed.
 Constants that contacts determine are written into the sensor file's [pad] section with their 90 % intervals; constants
 that remain as open as the range of simulated pads are left out. With --ball-mm it is one recording in which a ball of
-that diameter was pressed onto the pad several times, which tells of all constants, best after a weight was laid on it.
+that diameter was pressed onto the pad several times, after a weight was laid on it.
 """
 
 import argparse
@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from edge.terminal.argument_types import positive
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.pad_constants import Pad
-from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file, with_scale
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 from train.data.real_grips import recorded_sets, recording_paths
 from train.data.recorded_taps import recorded_presses
@@ -71,28 +72,39 @@ def contact_pads(folder: Path) -> dict[str, tuple[str, Pad]]:
 
 
 def ball_pads(path: Path, diameter_mm: float, file: SensorFile) -> dict[str, tuple[str, Pad]]:
-    """Return of each sensor of a recording how many presses of a ball are fitted, and its pad by them.
+    """Return of each sensor that a ball is pressed onto in a recording how many presses these are, and its pad by them.
+
+    A constant of the sensor file without an interval was entered by a person: it is taken as known, and kept. One with
+    an interval was measured, and is measured anew: taken as known, the same presses would count again with each call.
 
     RecordingError, BaselineRefusedError or DatasetError if there are too few, or they are not of that ball.
     """
     recording, pads = load_recording(path), {}
-    for name in (track.sensor for track in recording.tracks):
+    for track in recording.tracks:
+        name = track.sensor.removeprefix("xela_")
+        if path.suffix.lower() == ".csv" and name not in file.sensors and len(file.sensors) == 1:
+            name = next(iter(file.sensors))  # a CSV does not state its sensor
         entry = file.sensors.get(name, SensorEntry())
+        if track.geometry != USPA44:
+            raise DatasetError(f"{path}: sensor {track.sensor} is a {track.geometry.name}, expected a {USPA44.name}")
         if recording.origin == "emulated" and file.path is not None and not entry.emulated:
             raise DatasetError(f"{path} is of an emulated sensor, and sensor {name} in {file.path} of a device")
-        presses = recorded_presses(path, entry, name)
-        known = with_scale(entry.used_pad, entry.counts_per_newton, entry.counts_per_newton_interval) or Pad()
-        if "counts_per_newton" not in known.intervals:
+        presses = recorded_presses(recording, entry, track.sensor)
+        if not presses and len(recording.tracks) > 1:
+            continue  # the other finger
+        if entry.counts_per_newton is None or entry.counts_per_newton_interval is None:
             raise DatasetError(
                 f"counts per newton of sensor {name} are not in the sensor file, and a ball needs them: "
                 "lay a weight on the pad with edge-sr doctor, and pass its file as --out"
             )
-        by_hand = entry.pad or Pad()
-        fitted = fit_ball(presses, diameter_mm, known)
-        pads[name] = (
-            f"{len(presses)} presses of a ball",
-            replace(fitted, gains=by_hand.gains, gain_half_widths=by_hand.gain_half_widths),
-        )
+        before = entry.pad or Pad()
+        entered = {name: value for name, value in before.constants.items() if name not in before.intervals}
+        by_hand = Pad(**dict[str, Any](entered), gains=before.gains, gain_half_widths=before.gain_half_widths)
+        weighed = {"counts_per_newton": entry.counts_per_newton_interval}
+        known = replace(by_hand, counts_per_newton=entry.counts_per_newton, intervals=weighed)
+        pads[name] = f"{len(presses)} presses of a ball", fit_ball(presses, diameter_mm, known).behind(by_hand)
+    if not pads:
+        raise DatasetError(f"{path} has no press on any sensor: press the ball alone, slowly, all over the pad")
     return pads
 
 
@@ -115,7 +127,8 @@ def table(sensor: str, contacts: str, pad: Pad) -> str:
     for name in RANGES:
         known = f"{'-':>10}  not determined by these contacts"
         if name in pad.constants:
-            known = f"{pad.constants[name]:10.4g}  " + "{:.4g} .. {:.4g}".format(*pad.intervals[name])
+            ends = "{:.4g} .. {:.4g}".format(*pad.intervals[name]) if name in pad.intervals else "entered by hand"
+            known = f"{pad.constants[name]:10.4g}  {ends}"
         lines.append(f"{name:18} {'{:.4g} .. {:.4g}'.format(*RANGES[name]):>18} {known}")
     if pad.gains is None or pad.gain_half_widths is None:
         return "\n".join(lines)

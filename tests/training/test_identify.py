@@ -123,26 +123,32 @@ class Ball:
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
-    return Ball(tmp_path_factory.mktemp("ball"), 8)
+    return Ball(tmp_path_factory.mktemp("ball"), 6)
 
 
-def weighed(ball, path):
+def weighed(ball, path, pad=None):
     """Write a sensor file with the counts per newton of a ball's pad, within 8 %, and return its path."""
     scale = ball.pad.counts_per_newton
-    entry = SensorEntry(counts_per_newton=scale, counts_per_newton_interval=(0.92 * scale, 1.08 * scale))
+    entry = SensorEntry(counts_per_newton=scale, counts_per_newton_interval=(0.92 * scale, 1.08 * scale), pad=pad)
     save_sensor_file(path, SensorFile(sensors={"4": entry}))
     return path
 
 
 def test_presses_of_a_ball_give_the_constants(ball, tmp_path, capsys):
-    out = weighed(ball, tmp_path / "sensor.toml")
+    """What a person entered is kept, and what was measured before does not count again."""
+    before = Pad(pitch_mm=4.7, thickness_mm=5.2, intervals={"thickness_mm": (5.1, 5.3)})
+    out = weighed(ball, tmp_path / "sensor.toml", before)
     identify.main([str(ball.path), "--ball-mm", "40", "--out", str(out)])
-    pad = load_sensor_file(out).pads["4"]
-    for name in RANGES:
-        assert pad.intervals[name][0] <= getattr(ball.pad, name) <= pad.intervals[name][1], name
+    pad = load_sensor_file(out).sensors["4"].pad
+    assert pad.pitch_mm == 4.7 and pad.counts_per_newton is None and "pitch_mm" not in pad.intervals
+    assert {"thickness_mm", "poisson", "in_plane_share", "magnet_height_mm", "free_sides"} <= set(pad.intervals)
+    for name, (low, high) in pad.intervals.items():
+        assert low <= getattr(ball.pad, name) <= high, name
+        assert high - low < np.ptp(RANGES[name]), name
     for name in ("thickness_mm", "poisson", "in_plane_share"):
         assert abs(getattr(pad, name) - getattr(ball.pad, name)) < 0.15 * np.ptp(RANGES[name]), name
-    assert "4: 8 presses of a ball" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "4: 6 presses of a ball" in shown and "entered by hand" in shown
 
 
 @pytest.mark.night
@@ -159,5 +165,8 @@ def test_a_ball_without_a_weight_or_with_few_presses_is_one_line(tmp_path):
     with pytest.raises(SystemExit, match=r"counts per newton of sensor 4 are not in the sensor file, .*: lay a weight"):
         identify.main([str(few.path), "--ball-mm", "40"])
     out = weighed(few, tmp_path / "sensor.toml")
+    free = write_npz(tmp_path / "free.npz", np.random.default_rng(6).integers(29998, 30003, (300, 3, 4, 4)))
+    with pytest.raises(SystemExit, match=r"0 presses with 0 scans below .* expected 12 or more"):
+        identify.main([str(free), "--ball-mm", "40", "--out", str(out)])
     with pytest.raises(SystemExit, match=r"5 presses with 10 scans below .* expected 12 or more"):
         identify.main([str(few.path), "--ball-mm", "40", "--out", str(out)])

@@ -62,7 +62,8 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
     """
     if path.suffix == ".npy":
         return _published_taps(path)
-    recording, track, counts = _zeroed(path, entry, sensor)
+    recording = load_recording(path)
+    track, counts = _zeroed(recording, entry, sensor)
     if not recording.poses:
         raise DatasetError(
             f"{path} has no poses: record with --poses, or add columns {', '.join(CSV_POSES)} to the CSV"
@@ -83,25 +84,25 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
     return taps
 
 
-def recorded_presses(path: Path, entry: SensorEntry, sensor: str) -> list[NDArray[np.float32]]:
+def recorded_presses(recording: Recording, entry: SensorEntry, sensor: str) -> list[NDArray[np.float32]]:
     """Return the rising scans (frames, 3, rows, cols) of each press on one sensor, over the pad that was free before.
 
-    RecordingError, BaselineRefusedError or DatasetError if the sensor is not there, or the pad is never free.
+    BaselineRefusedError or DatasetError if the sensor is not there, or the pad is never free.
     """
-    return [frames for frames, _ in _cut(_zeroed(path, entry, sensor)[2])]
+    return [frames for frames, _ in _cut(_zeroed(recording, entry, sensor)[1])]
 
 
-def _zeroed(path: Path, entry: SensorEntry, sensor: str) -> tuple[Recording, Track, NDArray[np.float32]]:
-    """Return a recording, its track of a sensor, and that track's scans (n, 3, rows, cols) over its free pad."""
-    recording = load_recording(path)
+def _zeroed(recording: Recording, entry: SensorEntry, sensor: str) -> tuple[Track, NDArray[np.float32]]:
+    """Return the track of a sensor, and its scans (n, 3, rows, cols) over its free pad."""
     tracks = {track.sensor: track for track in recording.tracks}
     track = recording.tracks[0] if len(tracks) == 1 else tracks.get(sensor)
     if track is None:
-        raise DatasetError(f"{path} has the sensors {', '.join(tracks)}, none of them {sensor}")
-    raw = entry.mounting.place_counts(track.counts) if path.suffix.lower() == ".csv" else track.counts
+        raise DatasetError(f"{recording.path} has the sensors {', '.join(tracks)}, none of them {sensor}")
+    is_csv = recording.path.suffix.lower() == ".csv"
+    raw = entry.mounting.place_counts(track.counts) if is_csv else track.counts
     rest = free_stretch(raw).baseline(track.sensor, np.nan)
     mounting = recording.mountings.get(track.sensor, entry.mounting)
-    return recording, track, np.nan_to_num(np.stack([deformation(scan, rest, mounting) for scan in raw]))
+    return track, np.nan_to_num(np.stack([deformation(scan, rest, mounting) for scan in raw]))
 
 
 def load_tap_parts(path: Path, sensor: str, pad: SensorPad) -> dict[str, PressSet]:

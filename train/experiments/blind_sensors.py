@@ -126,9 +126,9 @@ def _sensors(bench: Workbench) -> Iterator[BlindSensor]:
         true = {name: getattr(pad, name) for name in PAD_RANGES} | {"counts_per_newton": pad.counts_per_newton * scale}
         true_gains = tuple((gains / scale).ravel().tolist())
         weighed = Weighed(true["counts_per_newton"] * rng.normal(1, COVERED_ERROR / LEVEL_90), COVERED_ERROR)
-        found = with_scale(learned(contacts, model).pad(), weighed.counts_per_newton, weighed.interval) or SensorPad()
-        by_ball = fit_ball(_ball_presses(pad, chips, rng, number), _BALL_MM, found)
-        by_ball = replace(by_ball, gains=found.gains, gain_half_widths=found.gain_half_widths)
+        scale = with_scale(None, weighed.counts_per_newton, weighed.interval) or SensorPad()
+        found = learned(contacts, model).pad().behind(scale)
+        by_ball = found.behind(fit_ball(_ball_presses(pad, chips, rng, number), _BALL_MM, scale).behind(scale))
         known = knowledge_of(SensorFile(sensors={str(number): SensorEntry(pad=by_ball)}), None)
         truth = SensorPad(**true, intervals={}, gains=true_gains, gain_half_widths=(0.0,) * GAINS)
         yield BlindSensor(number, chips, truth, known, found)

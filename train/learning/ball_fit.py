@@ -38,7 +38,8 @@ _WIDENING: Final = 2.0  # of intervals, by simulated sensors: two scans of a pre
 MOST_MISFIT: Final = 12.0
 _MOST_CONTRADICTION: Final = 16.0  # sum of squares, each over its variance
 LEAST_SCANS: Final = 12
-MOST_SCANS: Final = 24  # each takes a second or two to fit
+MOST_PRESSES: Final = 12  # each takes two seconds or three to fit
+_ENTERED: Final = 0.01  # of its range, how far a constant without an interval may be off
 _OF_PRESS: Final = len(_MOVES) + 1 + len(AXES)
 _Array = NDArray[np.float64]
 
@@ -48,8 +49,8 @@ class _Presses:
 
     def __init__(self, presses: Sequence[NDArray[np.floating]], diameter_mm: float, known: SensorPad) -> None:
         radius = np.log(diameter_mm / 2) + _BALL_ERROR * np.array([-LEVEL_90, LEVEL_90])
-        ends = np.array([known.intervals.get(name, RANGES[name]) for name in RANGES] + [(0, _CROSS_TALK), radius])
-        told = np.array([name in known.intervals for name in RANGES] + [False, True])
+        ends = np.array([_known_ends(known, name) for name in RANGES] + [(0, _CROSS_TALK), radius])
+        told = np.array([name in known.constants for name in RANGES] + [False, True])
         self.middle = ends.mean(axis=1)
         # A constant is normal within a measured interval, and else uniform within its range.
         self.spread = np.ptp(ends, axis=1) / np.where(told, 2 * LEVEL_90, np.sqrt(12))
@@ -144,27 +145,36 @@ def _light(presses: Sequence[NDArray[np.floating]], most_counts: float) -> _Arra
 
     DatasetError if they are fewer than LEAST_SCANS.
     """
-    picked = []
+    pairs = []
     for scans in presses:
         sums = scans[:, AXES.index("z")].sum(axis=(1, 2))
         if len(light := np.flatnonzero(sums <= most_counts)):
             half = np.abs(sums - sums[light[-1]] / 2).argmin()
-            picked += [scans[at].ravel() for at in dict.fromkeys((int(half), int(light[-1])))]
-    if len(picked) < LEAST_SCANS:
+            pairs.append([scans[at].ravel() for at in dict.fromkeys((int(half), int(light[-1])))])
+    if (count := sum(map(len, pairs))) < LEAST_SCANS:
         raise DatasetError(
-            f"{len(presses)} presses with {len(picked)} scans below {most_counts:.0f} counts in the sum of z, expected "
+            f"{len(presses)} presses with {count} scans below {most_counts:.0f} counts in the sum of z, expected "
             f"{LEAST_SCANS} or more: press the ball alone, slowly, all over the pad, which is free in between"
         )
-    return np.array(picked[:: -(-len(picked) // MOST_SCANS)], dtype=np.float64)
+    spread = np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PRESSES)).round().astype(int)
+    return np.array([scan for at in spread for scan in pairs[at]], dtype=np.float64)
+
+
+def _known_ends(known: SensorPad, name: str) -> tuple[float, float]:
+    """Return the bounds of a constant: measured ones, its range, or hardly any where only its value is known."""
+    if name not in known.constants or name in known.intervals:
+        return known.intervals.get(name, RANGES[name])
+    away = _ENTERED * (RANGES[name][1] - RANGES[name][0])
+    return known.constants[name] - away, known.constants[name] + away
 
 
 def fit_ball(presses: Sequence[NDArray[np.floating]], diameter_mm: float, known: SensorPad) -> SensorPad:
-    """Return constants of the pad that explains presses of a ball best, with 90 % intervals.
+    """Return those constants of a pad that presses of a ball determine, with 90 % intervals; not counts per newton.
 
     Args:
         presses: scans (n, 3, rows, cols) of each from first touch on, in counts over the pad that was free just before.
         diameter_mm: of the ball, in [mm].
-        known: of the sensor; of constants alone those with an interval.
+        known: of the sensor; a constant without an interval is as good as certain.
 
     Raises:
         DatasetError: they are too few, or no pad that is simulated reads so.
@@ -197,6 +207,8 @@ def fit_ball(presses: Sequence[NDArray[np.floating]], diameter_mm: float, known:
     intervals: dict[str, tuple[float, float]] = {}
     for name, value, wide in zip(RANGES, values.tolist(), half.tolist(), strict=False):
         low, high = RANGES[name]
-        constants[name] = value
-        intervals[name] = (min(value, max(value - wide, low)), max(value, min(value + wide, high)))
+        # One that stays as open as its range is left out, and the weight determines counts per newton better.
+        if 2 * wide < high - low and name not in known.constants:
+            constants[name] = value
+            intervals[name] = (min(value, max(value - wide, low)), max(value, min(value + wide, high)))
     return SensorPad(**dict[str, Any](constants), intervals=intervals)
