@@ -97,24 +97,32 @@ def ball_pads(path: Path, diameter_mm: float, file: SensorFile) -> dict[str, tup
                 f"counts per newton of sensor {name} are not in the sensor file, and a ball needs them: "
                 "lay a weight on the pad with edge-sr doctor, and pass its file as --out"
             )
-        before = entry.pad or Pad()
-        entered = {name: value for name, value in before.constants.items() if name not in before.intervals}
-        by_hand = Pad(**dict[str, Any](entered), gains=before.gains, gain_half_widths=before.gain_half_widths)
-        weighed = {"counts_per_newton": entry.counts_per_newton_interval}
-        known = replace(by_hand, counts_per_newton=entry.counts_per_newton, intervals=weighed)
-        pads[name] = f"{len(presses)} presses of a ball", fit_ball(presses, diameter_mm, known).behind(by_hand)
+        pad = entry.pad or Pad()
+        known = replace(
+            entered(pad),
+            counts_per_newton=entry.counts_per_newton,
+            intervals={"counts_per_newton": entry.counts_per_newton_interval},
+            gains=pad.gains,
+            gain_half_widths=pad.gain_half_widths,
+        )
+        pads[name] = f"{len(presses)} presses of a ball", fit_ball(presses, diameter_mm, known)
     if not pads:
         raise DatasetError(f"{path} has no press on any sensor: press the ball alone, slowly, all over the pad")
     return pads
 
 
-def extended(path: Path, pads: Mapping[str, Pad]) -> SensorFile:
-    """Return the existing sensor file with these pads, or a new one with these pads alone."""
-    before = load_sensor_file(path) if path.exists() else SensorFile()
+def entered(pad: Pad) -> Pad:
+    """Return the constants of a sensor file's pad that a person entered: those without an interval."""
+    return Pad(**dict[str, Any]({name: value for name, value in pad.constants.items() if name not in pad.intervals}))
+
+
+def extended(before: SensorFile, pads: Mapping[str, Pad]) -> SensorFile:
+    """Return a sensor file with these pads: what a person entered stays, and what these do not determine."""
     sensors = dict(before.sensors)
     for name, pad in pads.items():
         entry = sensors.get(name, SensorEntry(assumed=frozenset(("mounting",))))
-        sensors[name] = replace(entry, pad=pad)
+        there = entry.pad or Pad()
+        sensors[name] = replace(entry, pad=there.behind(pad.behind(entered(there))))
     return replace(before, sensors=sensors)
 
 
@@ -148,17 +156,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--out", type=Path, metavar="SENSOR.toml", help="a sensor file to extend or to write")
     options = parser.parse_args(arguments)
     with ended_by_errors("train.identify"):
-        file = SensorFile() if options.out is None or not options.out.exists() else load_sensor_file(options.out)
+        file = _file(options.out)
         if options.ball_mm is None:
             told = contact_pads(options.recordings)
         else:
             told = ball_pads(options.recordings, options.ball_mm, file)
-        for name, (contacts, pad) in told.items():
-            sys.stdout.write(table(name, contacts, pad) + "\n")
+        pads = {name: pad for name, (_, pad) in told.items()}
+        for name, pad in extended(file, pads).measured_pads.items():
+            if name in told:
+                sys.stdout.write(table(name, told[name][0], pad) + "\n")
         if options.out is not None:
-            with changing(options.out):
-                save_sensor_file(options.out, extended(options.out, {name: pad for name, (_, pad) in told.items()}))
+            with changing(options.out):  # which another program may have changed meanwhile
+                save_sensor_file(options.out, extended(_file(options.out), pads))
             sys.stdout.write(f"{options.out}: pads of {', '.join(told)}\n")
+
+
+def _file(path: Path | None) -> SensorFile:
+    return SensorFile() if path is None or not path.exists() else load_sensor_file(path)
 
 
 if __name__ == "__main__":

@@ -78,11 +78,14 @@ def test_the_sensor_file_that_is_there_is_extended(tmp_path):
     path = tmp_path / "sensor.toml"
     save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(counts_per_newton=1100.0), "5": SensorEntry()}))
     pad = Pad(poisson=0.45, intervals={"poisson": (0.43, 0.47)}, gains=tuple([1.1] * CHANNELS))
-    save_sensor_file(path, identify.extended(path, {"4": pad}))
+    save_sensor_file(path, identify.extended(load_sensor_file(path), {"4": pad}))
     found = load_sensor_file(path)
     assert found.pads == {"4": pad}
     assert set(found.sensors) == {"4", "5"}
     assert found.counts_per_newton == {"4": 1100.0}
+    by_hand_and_ball = Pad(poisson=0.42, thickness_mm=4.1, intervals={"thickness_mm": (4.0, 4.2)})
+    kept = identify.extended(SensorFile(sensors={"4": SensorEntry(pad=by_hand_and_ball)}), {"4": pad}).pads["4"]
+    assert (kept.poisson, kept.thickness_mm, kept.gains) == (0.42, 4.1, pad.gains)
 
 
 def test_a_folder_without_recordings_is_one_line(tmp_path):
@@ -135,7 +138,7 @@ def weighed(ball, path, pad=None):
 
 
 def test_presses_of_a_ball_give_the_constants(ball, tmp_path, capsys):
-    """What a person entered is kept, and what was measured before does not count again."""
+    """A constant that a person entered is kept, and what was measured before does not count again."""
     before = Pad(pitch_mm=4.7, thickness_mm=5.2, intervals={"thickness_mm": (5.1, 5.3)})
     out = weighed(ball, tmp_path / "sensor.toml", before)
     identify.main([str(ball.path), "--ball-mm", "40", "--out", str(out)])
