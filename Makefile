@@ -19,12 +19,11 @@ test: $(VENV)/.dev  ## everything else, all tests; three at a time on two cores,
 night: $(VENV)/.dev  ## the tests that train and export for minutes
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m night
 
-lint: $(VENV)/.dev  ## format, lint, types, import rules, plain English
+lint: $(VENV)/.dev  ## format, lint, types, import rules
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
-	$(BIN)/python .ci/plain_english.py
 
 docs: $(VENV)/.docs  ## README.md, docs/ and reports/ as a site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
