@@ -105,7 +105,10 @@ def ball_pads(path: Path, diameter_mm: float, file: SensorFile) -> dict[str, tup
             gains=pad.gains,
             gain_half_widths=pad.gain_half_widths,
         )
-        pads[name] = f"{len(presses)} presses of a ball", fit_ball(presses, diameter_mm, known)
+        poses = [pose for _, pose in presses if pose is not None]
+        posed = len(poses) == len(presses)
+        told = f"{len(presses)} presses of a ball{' at stated poses' * posed}"
+        pads[name] = told, fit_ball([scans for scans, _ in presses], diameter_mm, known, poses if posed else ())
     if not pads:
         raise DatasetError(f"{path} has no press on any sensor: press the ball alone, slowly, all over the pad")
     return pads

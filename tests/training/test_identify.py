@@ -104,9 +104,9 @@ def test_real_recordings_give_each_sensor_its_gains(tmp_path, capsys):
 
 
 class Ball:
-    """A recording of a ball of 40 mm pressed onto a simulated pad, and the pad."""
+    """A recording of a ball of 40 mm pressed onto a simulated pad, and the pad; with its poses in a `unit` of mm."""
 
-    def __init__(self, folder, presses):
+    def __init__(self, folder, presses, unit=None):
         rng = np.random.default_rng(5)
         self.pad = SimulatedPad(thickness_mm=4.0, poisson=0.42, in_plane_share=0.3, shear_modulus_mpa=0.13)
         gripped, at = GrippedPad(self.pad), rng.uniform(-4, 4, (2, presses, 1, 1))
@@ -120,13 +120,20 @@ class Ball:
         free = np.zeros((150, 3, 4, 4))
         scans = np.concatenate([free] + [np.concatenate([one, free]) for one in np.split(done.counts, presses)])
         scans = 30000 + scans + rng.normal(0, 1.5, scans.shape)
+        turn = rng.uniform(-0.5, 0.5, presses)
+        centre = 200 + 50j - np.exp(1j * (turn + 1.2)) * ([1, 1j] @ at.reshape(2, presses))  # mounted as it came
+        rows = np.stack(
+            [centre.real * (unit or 1), centre.imag * (unit or 1), np.degrees(turn), 0.05 + 0 * turn, 1 + 0 * turn]
+        )
+        begun_ns = (150 + (150 + len(course)) * np.arange(presses)) * 10_000_000
+        poses = {"pose_time_ns": begun_ns, "pose": rows.T, "pose_holds": np.ones(presses, bool)}
         self.path = folder / "ball.npz"
-        write_npz(self.path, scans.round().astype(np.uint16))
+        write_npz(self.path, scans.round().astype(np.uint16), **({} if unit is None else poses))
 
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
-    return Ball(tmp_path_factory.mktemp("ball"), 6)
+    return Ball(tmp_path_factory.mktemp("ball"), 6, unit=1.0)
 
 
 def weighed(ball, path, pad=None):
@@ -139,19 +146,26 @@ def weighed(ball, path, pad=None):
 
 def test_presses_of_a_ball_give_the_constants(ball, tmp_path, capsys):
     """A constant that a person entered is kept, and what was measured before does not count again."""
-    before = Pad(pitch_mm=4.7, thickness_mm=5.2, intervals={"thickness_mm": (5.1, 5.3)})
+    before = Pad(magnet_height_mm=2.5, thickness_mm=5.2, intervals={"thickness_mm": (5.1, 5.3)})
     out = weighed(ball, tmp_path / "sensor.toml", before)
     identify.main([str(ball.path), "--ball-mm", "40", "--out", str(out)])
     pad = load_sensor_file(out).sensors["4"].pad
-    assert pad.pitch_mm == 4.7 and pad.counts_per_newton is None and "pitch_mm" not in pad.intervals
-    assert {"thickness_mm", "poisson", "in_plane_share", "magnet_height_mm", "free_sides"} <= set(pad.intervals)
+    assert pad.magnet_height_mm == 2.5 and pad.counts_per_newton is None and "magnet_height_mm" not in pad.intervals
+    assert {"thickness_mm", "poisson", "in_plane_share", "pitch_mm", "free_sides"} <= set(pad.intervals)
     for name, (low, high) in pad.intervals.items():
         assert low <= getattr(ball.pad, name) <= high, name
         assert high - low < np.ptp(RANGES[name]), name
     for name in ("thickness_mm", "poisson", "in_plane_share"):
         assert abs(getattr(pad, name) - getattr(ball.pad, name)) < 0.15 * np.ptp(RANGES[name]), name
     shown = capsys.readouterr().out
-    assert "4: 6 presses of a ball" in shown and "entered by hand" in shown
+    assert "4: 6 presses of a ball at stated poses\n" in shown and "entered by hand" in shown
+
+
+def test_poses_that_are_not_of_these_presses_are_one_line(tmp_path):
+    metres = Ball(tmp_path, 6, unit=0.001)
+    out = weighed(metres, tmp_path / "sensor.toml")
+    with pytest.raises(SystemExit, match=r"moves under the pad by .* of what the poses state: expected .* in mm"):
+        identify.main([str(metres.path), "--ball-mm", "40", "--out", str(out)])
 
 
 @pytest.mark.night

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.poses import GAP_NS, PoseTrack
+from firmware_bridge.poses import GAP_NS, PadPose, PoseTrack
 from firmware_bridge.recording.csv_reader import CSV_POSES
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
@@ -63,33 +63,40 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
     if path.suffix == ".npy":
         return _published_taps(path)
     recording = load_recording(path)
-    track, counts = _zeroed(recording, entry, sensor)
+    presses = recorded_presses(recording, entry, sensor)
     if not recording.poses:
         raise DatasetError(
             f"{path} has no poses: record with --poses, or add columns {', '.join(CSV_POSES)} to the CSV"
         )
-    times = track.time_ns if track.time_ns is not None and not recording.poses_by_row else np.arange(len(counts))
-    poses = iter([pose for pose in recording.poses if pose.sensor in (None, track.sensor)])
-    course, due, taps = PoseTrack(), next(poses, None), []
-    for frames, peak in _cut(counts):
-        time = int(times[peak])
-        while due is not None and due.time_ns <= time + GAP_NS * (not recording.poses_by_row):
-            course.add(due.time_ns, due.pose, holds=due.holds)
-            due = next(poses, None)
-        if (stated := course.at(time)) is not None:
-            pose = over_surface(Pose(0.0, 0.0, 0.0), stated.x_mm, stated.y_mm, stated.turn_deg)
-            taps.append(RecordedTap(frames, pose))
+    taps = [
+        RecordedTap(frames, over_surface(Pose(0.0, 0.0, 0.0), pose.x_mm, pose.y_mm, pose.turn_deg))
+        for frames, pose in presses
+        if pose is not None
+    ]
     if not taps:
         raise DatasetError(f"{path} has no tap with a pose: is it of a free pad, or do the poses end before?")
     return taps
 
 
-def recorded_presses(recording: Recording, entry: SensorEntry, sensor: str) -> list[NDArray[np.float32]]:
-    """Return the rising scans (frames, 3, rows, cols) of each press on one sensor, over the pad that was free before.
+def recorded_presses(
+    recording: Recording, entry: SensorEntry, sensor: str
+) -> list[tuple[NDArray[np.float32], PadPose | None]]:
+    """Return the rising scans (frames, 3, rows, cols) of each press on one sensor, and its pose where it has one.
 
-    BaselineRefusedError or DatasetError if the sensor is not there, or the pad is never free.
+    The scans are over the pad that was free before. BaselineRefusedError or DatasetError if the sensor is not there, or
+    the pad is never free.
     """
-    return [frames for frames, _ in _cut(_zeroed(recording, entry, sensor)[1])]
+    track, counts = _zeroed(recording, entry, sensor)
+    times = track.time_ns if track.time_ns is not None and not recording.poses_by_row else np.arange(len(counts))
+    poses = iter([pose for pose in recording.poses if pose.sensor in (None, track.sensor)])
+    course, due, presses = PoseTrack(), next(poses, None), []
+    for frames, peak in _cut(counts):
+        time = int(times[peak])
+        while due is not None and due.time_ns <= time + GAP_NS * (not recording.poses_by_row):
+            course.add(due.time_ns, due.pose, holds=due.holds)
+            due = next(poses, None)
+        presses.append((frames, course.at(time)))
+    return presses
 
 
 def _zeroed(recording: Recording, entry: SensorEntry, sensor: str) -> tuple[Track, NDArray[np.float32]]:
