@@ -103,7 +103,7 @@ def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
     """Return what a sensor file tells of a sensor, whose name may be left out of a file of one.
 
     Raises:
-        DatasetError: no such sensor, or several of them.
+        DatasetError: no such sensor, several of them, or an emulated one, of which nothing holds for a device.
     """
     names = ", ".join(file.sensors) or "none"
     if name is None and len(file.sensors) != 1:
@@ -112,6 +112,12 @@ def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
     if name not in file.sensors:
         raise DatasetError(f"--sensor {name}: the sensor file has {names}")
     entry = file.sensors[name]
+    if entry.emulated:
+        parts = ", ".join(sorted(entry.emulated))
+        raise DatasetError(
+            f"the sensor file has {parts} of an emulated sensor {name}, and no device is like it: write one of your "
+            "sensor with edge-sr doctor --out"
+        )
     pad = with_scale(entry.used_pad, entry.counts_per_newton, entry.counts_per_newton_interval) or Pad()
     ranges = dict(RANGES)
     for constant, value in pad.constants.items():
@@ -244,9 +250,10 @@ def _train(options: argparse.Namespace) -> None:
     out: Path = options.out
     work = out / "work"
     work.mkdir(parents=True, exist_ok=True)
-    knowledge = knowledge_of(load_sensor_file(options.sensor_file), options.sensor)
+    file = load_sensor_file(options.sensor_file)
+    knowledge = knowledge_of(file, options.sensor)
     say(knowledge.told())
-    grips = [] if options.recordings is None else recorded_grips(options.recordings)
+    grips = [] if options.recordings is None else recorded_grips(options.recordings, file)
     grips = [one for one in grips if one.free.sensor.removeprefix("xela_") == knowledge.name]
     if not grips and options.recordings is not None:
         raise DatasetError(f"{options.recordings} has no recording xela_{knowledge.name}.csv of this sensor")

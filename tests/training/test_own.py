@@ -1,5 +1,7 @@
 """A model for one sensor: what is known of it, what its network is told, and whether it is handed over."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from edge_samples import make_contract, write_model
@@ -7,6 +9,7 @@ from press_samples import make_press_set
 
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
+from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -28,6 +31,7 @@ THICK = Pad(
     gain_half_widths=(0.025,) * GAINS,
 )
 FILE = SensorFile(sensors={"4": SensorEntry(pad=THICK, counts_per_newton=1100.0)})
+REHEARSED = SensorFile(sensors={"4": SensorEntry(counts_per_newton=1100.0, emulated=frozenset({"force"}))})
 
 
 def test_pads_are_drawn_as_wide_as_what_is_not_known():
@@ -105,12 +109,16 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     [
         (None, [], "sensor.toml"),
         (SensorFile(sensors={"4": SensorEntry()}), [], "nothing is known of this sensor, "),
+        (REHEARSED, [], "has force of an emulated sensor 4, .*: write one of your sensor with edge-sr doctor --out"),
         (FILE, ["--mesh", "none.stl"], "none.stl: cannot be read"),
-        (FILE, ["--recordings", "."], "no recordings of real sensors"),
+        (FILE, ["--recordings", "."], "holds no recordings: expected a folder of TRIAL/xela_SENSOR.csv"),
+        (FILE, ["--recordings", "played"], "xela_4.csv is of an emulated sensor, expected one of a device"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, held, options, told):
     monkeypatch.chdir(tmp_path)
+    Path("played/trial").mkdir(parents=True)
+    Path("played/trial/xela_4.csv").write_text(f"{','.join(csv_header())},emulated\n{'30000,' * 48}1\n")
     if held is not None:
         save_sensor_file(tmp_path / "sensor.toml", held)
     with pytest.raises(SystemExit, match=rf"^train\.own: [^\n]*{told}[^\n]*$"):

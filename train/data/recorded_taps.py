@@ -34,6 +34,7 @@ from firmware_bridge.sensor_file.model import SensorEntry
 from firmware_bridge.zeroing.baseline import deformation
 from firmware_bridge.zeroing.free_stretch import free_stretch
 from train.data.presses import PressSet, load_presses
+from train.data.real_grips import check_track
 from train.errors import DatasetError, SurfaceError
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM, SAMPLES, SCALE, GrippedPad, Taps
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, depth_image
@@ -87,7 +88,7 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
 def recorded_presses(recording: Recording, entry: SensorEntry, sensor: str) -> list[NDArray[np.float32]]:
     """Return the rising scans (frames, 3, rows, cols) of each press on one sensor, over the pad that was free before.
 
-    BaselineRefusedError or DatasetError if the sensor is not there, or the pad is never free.
+    BaselineRefusedError or DatasetError if the sensor is not there or another one, or the pad is never free.
     """
     return [frames for frames, _ in _cut(_zeroed(recording, entry, sensor)[1])]
 
@@ -98,6 +99,7 @@ def _zeroed(recording: Recording, entry: SensorEntry, sensor: str) -> tuple[Trac
     track = recording.tracks[0] if len(tracks) == 1 else tracks.get(sensor)
     if track is None:
         raise DatasetError(f"{recording.path} has the sensors {', '.join(tracks)}, none of them {sensor}")
+    check_track(recording, track, entry)
     is_csv = recording.path.suffix.lower() == ".csv"
     raw = entry.mounting.place_counts(track.counts) if is_csv else track.counts
     rest = free_stretch(raw).baseline(track.sensor, np.nan)
