@@ -83,10 +83,9 @@ def check_track(recording: Recording, track: Track, entry: SensorEntry) -> None:
     Raises:
         DatasetError: its pad is of another model, or only one of recording and file is of an emulated sensor.
     """
-    if track.geometry != USPA44:
-        raise DatasetError(
-            f"{recording.path}: sensor {track.sensor} is a {track.geometry.name}, expected a {USPA44.name}"
-        )
+    if track.geometry != USPA44 or entry.mounting.taxel_count != USPA44.taxel_count:
+        got = f"{track.geometry.taxel_count} taxels, and {entry.mounting.taxel_count} in the sensor file"
+        raise DatasetError(f"{recording.path} has {got}, expected the {USPA44.taxel_count} of a {USPA44.name} in both")
     if (recording.origin == "emulated") == bool(entry.emulated):
         return
     of, expected = ("a device", "an emulated sensor") if entry.emulated else ("an emulated sensor", "a device")
@@ -122,6 +121,17 @@ def recorded_grips(folder: Path, known: SensorFile = _UNKNOWN) -> list[Grip]:
                     f"in {path} the summed z is up to {freer:.0f} counts lower than where {last} ends, expected a free "
                     "pad there: let go of it before a recording ends"
                 )
+    return grips
+
+
+def grips_of(folder: Path, sensor: str, known: SensorFile) -> list[Grip]:
+    """Return the recordings of one sensor, as of `recorded_grips`; DatasetError if one is of a free pad alone."""
+    grips = [one for one in recorded_grips(folder, known) if one.free.sensor.removeprefix("xela_") == sensor]
+    if not grips:
+        raise DatasetError(f"{folder} has no recording xela_{sensor}.csv of this sensor")
+    for one in grips:
+        if not loaded(one.zeroed()).any():
+            raise DatasetError(f"nothing presses the pad in {one.trial} of {folder}, expected a grip of a flat face")
     return grips
 
 
