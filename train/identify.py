@@ -56,6 +56,11 @@ def contact_pads(folder: Path, file: SensorFile) -> dict[str, tuple[str, Pad]]:
     model, sets, told = load_contact_model(CONTACTS), recorded_sets(folder, file), {}
     for sensor in dict.fromkeys(one.sensor for one in sets):
         counts = np.concatenate([one.counts for one in sets if one.sensor == sensor])
+        if len(dead := np.flatnonzero((np.ptp(counts, axis=0) == 0).all(axis=0))):
+            raise DatasetError(
+                f"taxel {dead[0]} (row by row, from 0) of {sensor} reads the same in all contacts, expected a whole "
+                "sensor: a dead taxel makes the gains of all others wrong"
+            )
         learner = learned(distinct(counts), model)
         told[sensor.removeprefix("xela_")] = f"{learner.contacts} distinct contacts", learner.pad()
     if not told:
@@ -156,7 +161,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.out is not None:
             with changing(options.out):  # which another program may have changed meanwhile
                 save_sensor_file(options.out, extended(_file(options.out), pads))
-            sys.stdout.write(f"{options.out}: pads of {', '.join(told)}\n")
+            new = {} if file.path is None else told.keys() - file.sensors.keys()
+            names = ", ".join(f"{name}, which was not in it" if name in new else name for name in told)
+            sys.stdout.write(f"{options.out}: pads of {names}\n")
 
 
 def _file(path: Path | None) -> SensorFile:

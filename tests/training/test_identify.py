@@ -4,6 +4,7 @@ from bridge_samples import write_npz
 
 from edge.doctor.guided_press import orders
 from edge.inference.bundled import example_recording
+from edge.perception.gain_learning import load_contact_model
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.mounting import Mounting
@@ -14,7 +15,7 @@ from train import identify
 from train.data.real_grips import recording_paths, recordings_folder
 from train.errors import DatasetError
 from train.families.family_shares import BARE
-from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z, learned
+from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z, learned, write_model
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import RANGES
 from train.physics.pad_draws import Pad as SimulatedPad
@@ -73,6 +74,14 @@ def test_weak_and_clipped_contacts_are_not_used(mixture):
         learned(read[:5], mixture.model())
 
 
+def test_the_contacts_that_were_there_stay_until_new_ones_are_whole(mixture, tmp_path):
+    path = tmp_path / "contacts.npz"
+    for _ in range(2):
+        write_model(path, mixture, mixture.model())
+    found = load_contact_model(path)
+    assert found.means.shape == mixture.means.shape and (tmp_path / "contacts.npz.bak").exists()
+
+
 def test_a_held_grip_is_one_contact(mixture):
     read = contacts(mixture, 2, np.ones(CHANNELS), np.zeros(len(CONSTANTS)), 8)
     read[1] = read[0] * np.linspace(0.5, 1.5, 16).reshape(4, 4)
@@ -110,7 +119,7 @@ def gripped(folder, mounting=AS_WIRED, *columns):
     return folder
 
 
-def test_gains_belong_to_the_places_and_axes_of_the_mounting(tmp_path):
+def test_gains_belong_to_the_places_and_axes_of_the_mounting(tmp_path, capsys):
     """Gains stay with their chips: a pad that is turned in the gripper reads the same contacts, elsewhere."""
     turned = Mounting(orders()["turned by 90 degrees clockwise"], True, (1, -1, -1))
     pads = []
@@ -120,6 +129,10 @@ def test_gains_belong_to_the_places_and_axes_of_the_mounting(tmp_path):
         identify.main([str(gripped(tmp_path / name, mounting)), "--out", str(out)])
         pads.append(load_sensor_file(out).sensors["4"].pad)
     assert pads[0].gains == pytest.approx(pads[1].gains, abs=1e-3) and np.ptp(pads[0].gains) > 0.05
+    assert capsys.readouterr().out.endswith("pads of 4\n")
+    (tmp_path / "even/trial/xela_4.csv").rename(tmp_path / "even/trial/xela_left.csv")
+    identify.main([str(tmp_path / "even"), "--out", str(tmp_path / "even.toml")])
+    assert capsys.readouterr().out.endswith("pads of left, which was not in it\n"), "no gains of sensor 4"
 
 
 def test_an_emulated_sensor_teaches_a_device_nothing_nor_the_other_way(tmp_path, capsys):
@@ -139,7 +152,23 @@ def test_an_emulated_sensor_teaches_a_device_nothing_nor_the_other_way(tmp_path,
     out = tmp_path / "practice.toml"
     save_sensor_file(out, SensorFile(sensors={"4": SensorEntry(emulated=emulated)}))
     identify.main([str(tmp_path / "device"), "--out", str(out)])
-    assert "pads of 4" in capsys.readouterr().out and load_sensor_file(out).sensors["4"].emulated == emulated
+    assert "pads of 4\n" in capsys.readouterr().out and load_sensor_file(out).sensors["4"].emulated == emulated
+
+
+def test_a_dead_taxel_is_one_line(tmp_path):
+    path = gripped(tmp_path) / "trial/xela_4.csv"
+    header, first, *rows = [line.split(",") for line in path.read_text().splitlines()]
+    stuck = [[*row[:15], *first[15:18], *row[18:]] for row in rows]
+    path.write_text("".join(f"{','.join(row)}\n" for row in [header, first, *stuck]))
+    with pytest.raises(SystemExit, match=r"^train\.identify: taxel 5 .* of xela_4 reads the same in all contacts, .*$"):
+        identify.main([str(tmp_path)])
+
+
+def test_a_pad_of_another_model_is_one_line(tmp_path):
+    folder, out = gripped(tmp_path / "grips"), tmp_path / "sensor.toml"
+    save_sensor_file(out, SensorFile("uSPa46", sensors={"4": SensorEntry(Mounting(taxel_count=24))}))
+    with pytest.raises(SystemExit, match=r"has 16 taxels, and 24 in the sensor file, expected the 16 of a uSPa44"):
+        identify.main([str(folder), "--out", str(out)])
 
 
 def test_a_pad_that_no_trial_lets_go_of_or_that_nothing_presses_is_one_line(tmp_path):

@@ -176,15 +176,9 @@ def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | 
     """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred."""
     name = grip.free.sensor
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
-    options, free = RuntimeOptions(every_scan=True), {name: grip.free}
+    options, free, mounted = RuntimeOptions(every_scan=True), {name: grip.free}, {name: grip.mounting}
     runtime = Runtime(
-        model,
-        source="replay",
-        estimator=estimator,
-        baselines=free,
-        mountings={name: grip.mounting},
-        pad=pad,
-        options=options,
+        model, source="replay", estimator=estimator, baselines=free, mountings=mounted, pad=pad, options=options
     )
     series = ScanSeries(name, USPA44)
     none = np.full(model.contract.pattern_shape, np.nan, dtype=np.float32)
