@@ -25,18 +25,20 @@ try:
 except ModuleNotFoundError as error:
     sys.exit(f"train_and_deploy: {error}: pip install -e '.[export]' in the checkout")
 
-from edge.api import BridgeError, EdgeError, NoDeviceError, Stream, load_model, open_runtime, open_source
+from edge.api import NoDeviceError, Stream, load_model, open_runtime, open_source
+from edge.terminal.argument_types import positive
+from firmware_bridge.in_place import write_in_place
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import freeze_presses
 from train.data.make_presses import make_presses, quiet_workers
 from train.data.presses import SEED
 from train.data.world import World
-from train.errors import TrainError
+from train.errors import ended_by_errors
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
-from train.own import Knowledge, compared, plan_of
+from train.own import REPLACED, Knowledge, compared, plan_of
 from train.physics.pad_draws import KNOWN, RANGES
-from train.surfaces.meshes import mesh_name
+from train.surfaces.meshes import mesh_name, size_of
 
 UNSEEN = 240
 """Presses by which the network is calibrated, and as many by which it is compared, on pads of their own."""
@@ -46,6 +48,9 @@ def train(mesh: Path, out: Path, *, minutes: float, figures: float, seed: int) -
     """Train a model from a mesh, as OUT/NAME.onnx, and return True if it is better than the bundled one."""
     work, name, surface = out / "work", out.resolve().name, mesh_name(mesh)
     work.mkdir(parents=True, exist_ok=True)
+    print(size_of(surface), flush=True)
+    handed = out / f"{name}.onnx"
+    before = {REPLACED: load_model(handed)} if handed.exists() else {}
     shares = {surface: 1 - figures, "glyph": figures / 2, "polygon": figures / 2}
     world = World(families={family: share for family, share in shares.items() if share}, seed=seed)
     plan = plan_of(minutes, world, work)
@@ -63,12 +68,12 @@ def train(mesh: Path, out: Path, *, minutes: float, figures: float, seed: int) -
     # objects that it was not trained for.
     export([str(work / f"{name}.pt"), "--out", str(work), "--validation", str(work / "validation.npz")])
     own, any_sensor = load_model(work / f"{name}.onnx"), Knowledge("any", Pad(), RANGES)
-    verdict = compared(own, any_sensor, {f"presses of {mesh.name}": test}, [])
+    verdict = compared(own, any_sensor, {f"presses of {mesh.name}": test}, [], before)
     print(verdict.table)
     if verdict.objection is not None:
         print(f"not handed over: {verdict.objection}. Train it for longer, or use the bundled model.")
         return False
-    (work / f"{name}.onnx").replace(out / f"{name}.onnx")
+    write_in_place(handed, lambda draft: draft.write_bytes((work / f"{name}.onnx").read_bytes()), load_model)
     return True
 
 
@@ -102,23 +107,19 @@ def main() -> None:
     add = parser.add_argument
     add("mesh", type=Path, help="STL, OBJ or PLY, in millimetres")
     add("--out", type=Path, required=True, help="folder for everything; its name is the model's")
-    add("--minutes", type=float, default=60.0, help="about how long all takes (60)")
+    add("--minutes", type=positive, default=60.0, help="about how long all takes (60)")
     add("--figures", type=float, default=0.0, help="share of the presses that are of random figures (0)")
     add("--seed", type=int, default=1, help="seed of everything random (1)")
     add("--source", help="source to try it on, as for edge-sr (default: the adapter plugged in, if any)")
-    add("--duration-s", type=float, default=10, help="seconds to try it (10)")
+    add("--duration-s", type=positive, default=10, help="seconds to try it (10)")
     options = parser.parse_args()
-    try:
+    with ended_by_errors("train_and_deploy"):
         if options.source is not None:
             open_source(options.source)  # a form that does not exist is refused now, not after the training
         out, minutes = options.out, options.minutes
         if not train(options.mesh, out, minutes=minutes, figures=options.figures, seed=options.seed):
             sys.exit(1)
         deploy(out / f"{out.resolve().name}.onnx", options.source, options.duration_s)
-    except KeyboardInterrupt:
-        sys.exit("train_and_deploy: stopped; the same command continues")
-    except (BridgeError, EdgeError, TrainError) as error:
-        sys.exit(f"train_and_deploy: {error}")
 
 
 if __name__ == "__main__":

@@ -127,6 +127,8 @@ def export(
     contract = contract_of(net, report, frozen)
     pad, readings = pad_of(contract.rows, contract.cols), list[Readings]()
     if intervals is not None and isinstance(net, CompactNet):
+        if (intervals.validation.scale, *intervals.validation.counts.shape[3:]) != (net.scale, pad.rows, pad.cols):
+            raise CheckpointError(f"{checkpoint} is at x{net.scale} of a {pad.name}, the validation presses are not")
         report = {**report, "options": {**report["options"], "intervals": True}}
         if intervals.training is None:
             net.add_intervals().contact_level.fill_(contract.contact_level)
@@ -289,7 +291,9 @@ def main(arguments: list[str] | None = None) -> None:
     lossy: list[str] = []
     with ended_by_errors("export"):
         options.out.mkdir(parents=True, exist_ok=True)
-        sensor = sensor_of(load_network(options.checkpoints[0])[1])
+        sensor, *others = (sensor_of(load_network(path)[1]) for path in options.checkpoints)
+        if any(other != sensor for other in others):  # whose gains the validation presses are read with
+            raise CheckpointError("these checkpoints are not all of the same sensor: export each by itself")
         nuisances = Nuisances() if sensor is None else sensor.nuisances
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
         if options.test is not None:

@@ -40,7 +40,8 @@ def ended_by_errors(program: str) -> Iterator[None]:
         if isinstance(error, (TrainError, BridgeError, EdgeError)):
             sys.exit(f"{program}: {error}")
         if isinstance(error, OSError):
-            sys.exit(f"{program}: {error.filename}: {error.strerror}")
+            where = f"{error.filename}: " if error.filename else ""
+            sys.exit(f"{program}: {where}{error.strerror or error}")
         raise
 
 

@@ -28,26 +28,12 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
-from train.data.real_grips import recorded_sets, recording_paths
+from train.data.real_grips import recorded_sets
 from train.data.recorded_taps import recorded_presses
 from train.errors import DatasetError, ended_by_errors
 from train.learning.ball_fit import fit_ball
 from train.learning.contact_mixture import learned, normalise
 from train.physics.pad_draws import RANGES
-
-
-def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
-    """Return the distinct contacts (n, 3, rows, cols) of each sensor.
-
-    DatasetError if there are none, or one cannot be read.
-    """
-    if not recording_paths(folder):
-        raise DatasetError(f"{folder} holds no recordings: expected a folder of TRIAL/xela_SENSOR.csv")
-    sets = recorded_sets(folder)
-    return {
-        sensor: distinct(np.concatenate([one.counts for one in sets if one.sensor == sensor]))
-        for sensor in dict.fromkeys(one.sensor for one in sets)
-    }
 
 
 def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -62,12 +48,23 @@ def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
     return counts[kept]
 
 
-def contact_pads(folder: Path) -> dict[str, tuple[str, Pad]]:
-    """Return of each sensor of a folder how many distinct contacts it has, and its pad by them."""
-    model, told = load_contact_model(CONTACTS), {}
-    for sensor, counts in recorded_contacts(folder).items():
-        learner = learned(counts, model)
+def contact_pads(folder: Path, file: SensorFile) -> dict[str, tuple[str, Pad]]:
+    """Return of each sensor of a folder how many distinct contacts it has, and its pad by them.
+
+    DatasetError if there are none, or a recording cannot be read or is not of the file's sensor.
+    """
+    model, sets, told = load_contact_model(CONTACTS), recorded_sets(folder, file), {}
+    for sensor in dict.fromkeys(one.sensor for one in sets):
+        counts = np.concatenate([one.counts for one in sets if one.sensor == sensor])
+        if len(dead := np.flatnonzero((np.ptp(counts, axis=0) == 0).all(axis=0))):
+            raise DatasetError(
+                f"taxel {dead[0]} (row by row, from 0) of {sensor} reads the same in all contacts, expected a whole "
+                "sensor: a dead taxel makes the gains of all others wrong"
+            )
+        learner = learned(distinct(counts), model)
         told[sensor.removeprefix("xela_")] = f"{learner.contacts} distinct contacts", learner.pad()
+    if not told:
+        raise DatasetError(f"nothing presses a pad in the recordings of {folder}: expected contacts of many shapes")
     return told
 
 
@@ -85,10 +82,6 @@ def ball_pads(path: Path, diameter_mm: float, file: SensorFile) -> dict[str, tup
         if path.suffix.lower() == ".csv" and name not in file.sensors and len(file.sensors) == 1:
             name = next(iter(file.sensors))  # a CSV does not state its sensor
         entry = file.sensors.get(name, SensorEntry())
-        if track.geometry != USPA44:
-            raise DatasetError(f"{path}: sensor {track.sensor} is a {track.geometry.name}, expected a {USPA44.name}")
-        if recording.origin == "emulated" and file.path is not None and not entry.emulated:
-            raise DatasetError(f"{path} is of an emulated sensor, and sensor {name} in {file.path} of a device")
         presses = recorded_presses(recording, entry, track.sensor)
         if not presses and len(recording.tracks) > 1:
             continue  # the other finger
@@ -161,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with ended_by_errors("train.identify"):
         file = _file(options.out)
         if options.ball_mm is None:
-            told = contact_pads(options.recordings)
+            told = contact_pads(options.recordings, file)
         else:
             told = ball_pads(options.recordings, options.ball_mm, file)
         pads = {name: pad for name, (_, pad) in told.items()}
@@ -171,7 +164,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.out is not None:
             with changing(options.out):  # which another program may have changed meanwhile
                 save_sensor_file(options.out, extended(_file(options.out), pads))
-            sys.stdout.write(f"{options.out}: pads of {', '.join(told)}\n")
+            new = {} if file.path is None else told.keys() - file.sensors.keys()
+            names = ", ".join(f"{name}, which was not in it" if name in new else name for name in told)
+            sys.stdout.write(f"{options.out}: pads of {names}\n")
 
 
 def _file(path: Path | None) -> SensorFile:

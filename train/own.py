@@ -10,7 +10,7 @@ whose it is. Constants that the sensor file lacks are found by train.identify, w
 
 At the end it is compared with the bundled model, which is told the same, and with bilinear interpolation, on presses of
 pads like the sensor, of pads a little unlike it, and on --recordings, a folder of TRIAL/xela_SENSOR.csv. What loses is
-not handed over, nor what was compared on no recording. The same command continues an interrupted run.
+not handed over, nor what is worse than the model that is there. The same command continues an interrupted run.
 
 Taps of train.taps are a third of what it then learns from; those held out decide, also against models --beside it.
 """
@@ -25,7 +25,8 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -36,22 +37,25 @@ from edge.inference.contract import GAINS_CERTAINTY
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.argument_types import positive
 from firmware_bridge.in_place import write_in_place
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file, with_scale
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.make_presses import make_presses, quiet_workers
 from train.data.press_batches import OneSensor
 from train.data.presses import SEED, PressSet
-from train.data.real_grips import Grip, has_hole, play, recorded_grips
+from train.data.real_grips import Grip, grips_of, has_hole, play
 from train.data.recorded_taps import load_tap_parts
 from train.data.world import World, solve_pad
 from train.errors import DatasetError, TrainError, ended_by_errors
 from train.families.family_shares import FIGURES, SHARES
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
-from train.physics.pad_draws import KNOWN, RANGES
+from train.physics.gripped import SCALE
+from train.physics.pad_draws import KNOWN, RANGES, SIMULATED, constants
+from train.physics.pad_draws import Pad as SimulatedPad
 from train.report import bootstrap_interval
-from train.surfaces.meshes import mesh_name
+from train.surfaces.meshes import mesh_name, size_of
 
 _FIFTH: Final = 0.2
 """Share of a constant's range within which it is taken as known where nobody said how well, and by which the pads
@@ -74,6 +78,10 @@ class Knowledge:
         row = ModelSession(find_model(DEFAULT_MODEL)).contract.pad_row(self.pad)
         return OneSensor(tuple(row.tolist()), 1 - certainty, made_for)
 
+    def middle(self) -> SimulatedPad:
+        """Return a pad in the middle of the ranges."""
+        return SimulatedPad(**dict[str, Any]({name: sum(ends) / 2 for name, ends in self.ranges.items()}))
+
     def widened(self) -> Mapping[str, tuple[float, float]]:
         """Return ranges of pads that lie up to a fifth of a constant's range outside of what is known."""
         more = {name: _FIFTH * (high - low) for name, (low, high) in RANGES.items()}
@@ -94,17 +102,19 @@ class Knowledge:
 
 def _within(name: str, low: float, high: float) -> tuple[float, float]:
     """Return bounds of a constant that a simulated pad may have."""
-    least, most = RANGES[name]
-    apart = most - least
-    return max(low, least - apart, 0.0), min(high, most + apart, 0.4999 if name == "poisson" else np.inf)
+    least, most = SIMULATED[name]
+    return max(low, least), min(high, most)
 
 
 def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
     """Return what a sensor file tells of a sensor, whose name may be left out of a file of one.
 
     Raises:
-        DatasetError: no such sensor, or several of them.
+        DatasetError: no such sensor, several of them, an emulated one, of which nothing holds for a device, or one that
+            cannot be simulated.
     """
+    if file.geometry != USPA44:
+        raise DatasetError(f"the sensor file is of a {file.geometry.name}, expected a {USPA44.name}")
     names = ", ".join(file.sensors) or "none"
     if name is None and len(file.sensors) != 1:
         raise DatasetError(f"the sensor file has the sensors {names}: name one with --sensor")
@@ -112,9 +122,20 @@ def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
     if name not in file.sensors:
         raise DatasetError(f"--sensor {name}: the sensor file has {names}")
     entry = file.sensors[name]
+    if entry.emulated:
+        raise DatasetError(
+            f"the sensor file has {', '.join(sorted(entry.emulated))} of an emulated sensor {name}, and no device is "
+            "like it: write one of your sensor with edge-sr doctor --out"
+        )
     pad = with_scale(entry.used_pad, entry.counts_per_newton, entry.counts_per_newton_interval) or Pad()
     ranges = dict(RANGES)
     for constant, value in pad.constants.items():
+        least, most = SIMULATED[constant]
+        if not least <= value <= most:
+            raise DatasetError(
+                f"{constant} of sensor {name} is {value:g}, expected {least:g} to {most:g} of a pad that can be "
+                "simulated: measure it again, or take it out of the sensor file"
+            )
         apart = _FIFTH * (RANGES[constant][1] - RANGES[constant][0]) / 2
         ranges[constant] = _within(constant, *pad.intervals.get(constant, (value - apart, value + apart)))
     return Knowledge(name, pad, ranges)
@@ -164,7 +185,7 @@ def compared(
     knowledge: Knowledge,
     sets: Mapping[str, PressSet],
     grips: Sequence[Grip],
-    beside: Sequence[ModelSession] = (),
+    beside: Mapping[str, ModelSession] = MappingProxyType({}),
 ) -> Comparison:
     """Compare a model with the bundled one, told the same, and with bilinear interpolation.
 
@@ -173,15 +194,14 @@ def compared(
         knowledge: of its sensor.
         sets: presses that it was not trained on, by what they are; TAPPED are the sensor's own, read as they are.
         grips: recordings of the sensor that holds flat faces, which cover its pad.
-        beside: further models of the sensor, which TAPPED decide between.
+        beside: further models by name, which TAPPED decide between; one that is REPLACED must not be the better one.
     """
     bundled = ModelSession(find_model(DEFAULT_MODEL))
-    sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled} | {one.name: one for one in beside}
+    sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled} | dict(beside)
     bilinear = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"]
     cells: dict[str, list[str]] = {name: [] for name in (*models, "bilinear")}
     times_us: dict[str, list[float]] = {name: [] for name in models}
-    gains: dict[str, str] = {}
-    objections: list[str] = []
+    gains, objections = dict[str, str](), list[str]()
     for what, presses in sets.items():
         as_read = FrozenPresses(presses, np.ones(0, dtype=np.float32))
         frozen = as_read if what == TAPPED else freeze_presses(presses, SEED + 1, sensor.nuisances)
@@ -201,8 +221,9 @@ def compared(
             gain = f"{gained.mean():+.2f} ({low:+.2f} to {high:+.2f})"
             if name == bundled.name:
                 gains[what] = gain
-            decides = name in (bundled.name, "bilinear") or what == TAPPED
-            if name != OWN and decides and (high < 0 if what == UNLIKE else low <= 0):
+            # One that is made for a wider range is better outside of what is known by now.
+            decides = name in (bundled.name, "bilinear") or what == TAPPED or (name == REPLACED and what != UNLIKE)
+            if name != OWN and decides and (high < 0 if what == UNLIKE or name == REPLACED else low <= 0):
                 objections.append(f"on {what} it is {gain} dB to {name}")
     holes = {name: np.array([_holes(grip, model, knowledge.pad) for grip in grips]) for name, model in models.items()}
     for name, shares in holes.items() if grips else ():
@@ -229,6 +250,7 @@ def _holes(grip: Grip, model: ModelSession, pad: Pad) -> float:
 
 
 OWN: Final = "this model"
+REPLACED: Final = "the model that is there"  # under the name of the new one
 UNLIKE: Final = "pads a fifth unlike it"
 TAPPED: Final = "own taps at other poses"
 
@@ -244,38 +266,43 @@ def _train(options: argparse.Namespace) -> None:
     out: Path = options.out
     work = out / "work"
     work.mkdir(parents=True, exist_ok=True)
-    knowledge = knowledge_of(load_sensor_file(options.sensor_file), options.sensor)
+    file = load_sensor_file(options.sensor_file)
+    knowledge = knowledge_of(file, options.sensor)
     say(knowledge.told())
-    grips = [] if options.recordings is None else recorded_grips(options.recordings)
-    grips = [one for one in grips if one.free.sensor.removeprefix("xela_") == knowledge.name]
-    if not grips and options.recordings is not None:
-        raise DatasetError(f"{options.recordings} has no recording xela_{knowledge.name}.csv of this sensor")
-    taps = {} if options.taps is None else load_tap_parts(options.taps, knowledge.name, knowledge.pad)
-    beside = [ModelSession(path) for path in options.beside]
+    grips = [] if options.recordings is None else grips_of(options.recordings, knowledge.name, file)
+    middle = constants(knowledge.middle())
+    taps = {} if options.taps is None else load_tap_parts(options.taps, knowledge.name, knowledge.pad, middle)
+    handed = out / f"{out.resolve().name}.onnx"
+    beside = {one.name: one for one in map(ModelSession, options.beside)}
+    beside |= {REPLACED: ModelSession(handed)} if handed.exists() else {}
+    for name, one in beside.items():
+        if one.contract.scale != SCALE or (one.contract.taps > 1 and not one.contract.takes_poses):
+            got = f"{name} is a model of {one.contract.taps} taps at x{one.contract.scale}"
+            raise DatasetError(f"{got}, expected one of a single tap, or of several with poses, at x{SCALE}")
     if not knowledge.pad.constants and knowledge.pad.gains_certainty < _FIFTH:
         raise DatasetError(
             "nothing is known of this sensor, and a model for any sensor is there: lay a weight on it with "
             "edge-sr doctor, let edge-sr learn its gains from contacts, or find constants by train.identify"
         )
-    families = dict(SHARES) | {mesh_name(path, options.unit_mm): 20.0 for path in options.mesh}
+    meshes = [mesh_name(path, options.unit_mm) for path in options.mesh]
+    for mesh in meshes:
+        say(size_of(mesh))
+    families = dict(SHARES) | dict.fromkeys(meshes, 20.0)
     world = World(families=families, ranges=knowledge.ranges, seed=options.seed)
+    if not (grips or taps or options.without_recordings):
+        raise DatasetError(
+            "nothing to compare it on: a model for the wrong pad draws what looks right, so pass --recordings or "
+            "--taps, or --without-recordings to rely on the sensor file alone"
+        )
     plan = plan_of(options.minutes, world, work)
-    name = out.resolve().name
-    path, judges = trained(knowledge, world, plan, COMPARED, work / f"{name}.pt", taps.get("training"))
+    path, judges = trained(knowledge, world, plan, COMPARED, work / f"{handed.stem}.pt", taps.get("training"))
     if taps:
         judges[TAPPED] = taps["test"]
     verdict = compared(ModelSession(path), knowledge, judges, grips, beside)
     say(verdict.table)
-    objection = verdict.objection
-    if not grips and not taps and not options.without_recordings:
-        objection = objection or (
-            "it was compared on no recording, and a model for the wrong pad draws what looks right: pass --recordings "
-            "or --taps, or --without-recordings to rely on the sensor file alone"
-        )
-    if objection is not None:
-        say(f"not handed over: {objection}")
+    if verdict.objection is not None:
+        say(f"not handed over: {verdict.objection}")
         sys.exit(1)
-    handed = out / f"{name}.onnx"
     write_in_place(handed, lambda draft: draft.write_bytes(path.read_bytes()), load_session)
     say(f"from now on: edge-sr --sensor {options.sensor_file} --model {handed}")
 

@@ -18,13 +18,15 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edge.terminal.argument_types import positive
 from edge.terminal.progress_bar import tracked
+from firmware_bridge.in_place import check_writable
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.sensor_file.model import SensorEntry, load_sensor_file
 from train.data.presses import SEED, PressSet, join_presses, one_thread
@@ -33,7 +35,7 @@ from train.errors import DatasetError, ended_by_errors
 from train.networks.tactile_psf import PsfNet, fit_psf_net
 from train.own import Knowledge, knowledge_of, say
 from train.physics.gripped import FINE_SCALE, MAX_INDENTATION_MM, SCALE, TRACTION_SCALE, GrippedPad
-from train.physics.pad_draws import Pad, constants
+from train.physics.pad_draws import constants
 from train.physics.tpsf import resample_touching, spread, tpsf_pattern
 from train.surfaces.depth_image import Pose
 
@@ -50,9 +52,7 @@ def tapped(paths: Sequence[Path], surfaces: Sequence[Surface], knowledge: Knowle
 
     The number of a frame's pad is that of its tap, and the split into training, validation and test is by place.
     """
-    # What is not known of the sensor lies in the middle of its range.
-    middle: dict[str, Any] = {name: sum(ends) / 2 for name, ends in knowledge.ranges.items()}
-    gripped = GrippedPad(Pad(**middle))
+    gripped = GrippedPad(knowledge.middle())  # also of what is not known
     gains = np.reshape(knowledge.pad.gains or np.ones(USPA44.scan_shape), USPA44.scan_shape)
     parts: list[PressSet] = []
     places: list[tuple[object, ...]] = []
@@ -138,14 +138,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _make(options: argparse.Namespace) -> None:
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(options.out)  # before minutes are spent on it
     file = load_sensor_file(options.sensor_file)
     knowledge = knowledge_of(file, options.sensor)
     surfaces = [surface_of(path, options.unit_mm, options.pixel_mm) for path in options.surface]
     taps = tapped(options.recordings, surfaces, knowledge, file.sensors[knowledge.name])
+    if (deepest_mm := float(taps.indentation_mm.max())) > 2 * MAX_INDENTATION_MM:
+        raise DatasetError(
+            f"a tap is {deepest_mm:.2f} mm deep by the constants of the sensor file, expected at most "
+            f"{MAX_INDENTATION_MM:g} mm: press less, correct the poses, or lay a weight on it with edge-sr doctor"
+        )
     made, told = with_patterns(taps, options.truth, options.scale)
     made.save(options.out)
     shares = [f"{np.isin(made.pad, part).sum()} {name}" for name, part in made.config["split"].items()]
-    deepest = f"deepest {made.indentation_mm.max():.2f} mm by the constants of the sensor file"
+    deepest = f"deepest {deepest_mm:.2f} mm by the constants of the sensor file"
     say(f"{options.out}: {len(made)} LR-HR pairs, {', '.join(shares)}; {told}; {deepest}")
 
 
@@ -174,7 +181,7 @@ def _parser() -> argparse.ArgumentParser:
         help="pixels a pitch (10)",
     )
     add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm (1)")
-    add("--pixel-mm", type=float, default=0.1, help="side of a depth image's pixel in mm (0.1)")
+    add("--pixel-mm", type=positive, default=0.1, help="side of a depth image's pixel in mm (0.1)")
     return parser
 
 

@@ -27,7 +27,7 @@ from edge.inference.trust_model import (
     forward_model,
     small_network,
 )
-from firmware_bridge.in_place import write_in_place
+from firmware_bridge.in_place import check_writable, write_in_place
 from firmware_bridge.pad_geometry import AXES
 from train.data.press_batches import COUNTS_PER_UNIT
 from train.data.presses import PressSet, join_presses, load_presses
@@ -121,9 +121,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
     options = parser.parse_args(arguments)
     with ended_by_errors("trust"):
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(options.out)  # before minutes are spent on it
         data = join_presses([*map(load_presses, options.data)])
         text = json.dumps(fit_trust(data, seed=1)) + "\n"
-        options.out.parent.mkdir(parents=True, exist_ok=True)
         write_in_place(options.out, lambda draft: draft.write_text(text), lambda draft: json.loads(draft.read_text()))
     sys.stdout.write(f"{options.out}: {len(text) / 1e3:.0f} kB\n")
 

@@ -1,6 +1,8 @@
 """Export of networks, with and without poses: contract, parity, intervals, files, and the command."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import onnx
@@ -195,6 +197,25 @@ def test_what_cannot_be_exported_ends_in_one_line(tmp_path):
     for out, told in (("taken", ".*taken: File exists"), ("", r".*none\.pt .*No such file")):
         with pytest.raises(SystemExit, match=f"^export: {told}"):
             main([*options, str(tmp_path / out)])
+
+
+def test_checkpoints_that_do_not_belong_together_are_refused_before_the_first(folder, tmp_path):
+    PRESSES.save(tmp_path / "taps.npz")
+    coarse = {name: getattr(PRESSES, name)[:, ::5, ::5] for name in ("patterns", "touching")}
+    replace(PRESSES, **coarse).save(tmp_path / "coarse.npz")
+    report = json.loads((folder / "sure.json").read_text())
+    report["config"]["sensor"] = {"row": [0.0], "gain_spread": 0.1, "made_for": {}}
+    (tmp_path / "own.json").write_text(json.dumps(report))
+    shutil.copy(folder / "sure.pt", tmp_path / "own.pt")
+    for checkpoints, presses, told in (
+        ([folder / "sure.pt", tmp_path / "own.pt"], "taps", "these checkpoints are not all of the same sensor"),
+        ([folder / "sure.pt", tmp_path / "none.pt"], "taps", "none.pt is no checkpoint"),
+        ([folder / "sure.pt"], "coarse", "sure.pt is at x10 of a uSPa44, the validation presses are not"),
+    ):
+        command = [*map(str, checkpoints), "--validation", str(tmp_path / f"{presses}.npz"), "--out", str(tmp_path)]
+        with pytest.raises(SystemExit, match=rf"^export: [^\n]*{told}[^\n]*$"):
+            main(command)
+    assert not [*tmp_path.glob("*.onnx")]
 
 
 @pytest.mark.parametrize(

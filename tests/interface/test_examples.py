@@ -59,6 +59,7 @@ def loaded(name):
         ("print_force --source slcan:/dev/none", "print_force: /dev/none"),
         ("stop_on_area --area-mm2 9 --source slcan:/dev/none", "stop_on_area: /dev/none"),
         ("stop_on_area --area-mm2 9 --source demo", "stop_on_area: demo is emulated, not a sensor: pass --pretend to"),
+        ("train_and_deploy a.stl --out /dev/null/a", "train_and_deploy: /dev/null/a/work: Not a directory"),
         ("train_and_deploy a.stl --out a --source slcna:x", "train_and_deploy: source is 'slcna:x', expected one of"),
     ],
 )
@@ -297,4 +298,5 @@ def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
     assert code == 1, errors
     assert {path.name for path in empty.iterdir()} == {"ball"} and not (empty / "ball" / "ball.onnx").exists()
     assert any(line.startswith("this model | ") for line in out)
+    assert out[0].startswith("ball.stl: 12 x 12 x 12 mm, taken as in mm")
     assert out[-1].startswith("not handed over: on presses of ball.stl it is ")

@@ -2,6 +2,12 @@ import numpy as np
 import pytest
 from bridge_samples import write_npz
 
+from edge.doctor.guided_press import orders
+from edge.inference.bundled import example_recording
+from edge.perception.gain_learning import load_contact_model
+from firmware_bridge.recording.csv_reader import csv_header
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -9,12 +15,13 @@ from train import identify
 from train.data.real_grips import recording_paths, recordings_folder
 from train.errors import DatasetError
 from train.families.family_shares import BARE
-from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z, learned
+from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z, learned, write_model
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import RANGES
 from train.physics.pad_draws import Pad as SimulatedPad
 
 FOLDER = recordings_folder()
+AS_WIRED = Mounting()
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +74,14 @@ def test_weak_and_clipped_contacts_are_not_used(mixture):
         learned(read[:5], mixture.model())
 
 
+def test_the_contacts_that_were_there_stay_until_new_ones_are_whole(mixture, tmp_path):
+    path = tmp_path / "contacts.npz"
+    for _ in range(2):
+        write_model(path, mixture, mixture.model())
+    found = load_contact_model(path)
+    assert found.means.shape == mixture.means.shape and (tmp_path / "contacts.npz.bak").exists()
+
+
 def test_a_held_grip_is_one_contact(mixture):
     read = contacts(mixture, 2, np.ones(CHANNELS), np.zeros(len(CONSTANTS)), 8)
     read[1] = read[0] * np.linspace(0.5, 1.5, 16).reshape(4, 4)
@@ -89,8 +104,81 @@ def test_the_sensor_file_that_is_there_is_extended(tmp_path):
 
 
 def test_a_folder_without_recordings_is_one_line(tmp_path):
-    with pytest.raises(SystemExit, match=r"^train\.identify: .* expected a folder of TRIAL/xela_SENSOR.csv$"):
+    with pytest.raises(SystemExit, match=r"^train\.identify: .* expected a folder of TRIAL/xela_SENSOR.csv"):
         identify.main([str(tmp_path / "none")])
+
+
+def gripped(folder, mounting=AS_WIRED, *columns):
+    """Write the grips of the bundled recording as a sensor reads them that is mounted so, and return the folder."""
+    counts = load_recording(example_recording()).tracks[0].counts - 33_000
+    wired = (np.array(mounting.signs)[:, None, None] * counts)[:, [1, 0, 2] if mounting.swap_xy else [0, 1, 2]]
+    wired = wired.reshape(-1, 3, 16)[:, :, np.argsort(mounting.order)].transpose(0, 2, 1).reshape(-1, 48) + 33_000
+    (folder / "trial").mkdir(parents=True)
+    rows = [[*csv_header(), *columns], *([*row, *columns] for row in wired.tolist())]
+    (folder / "trial/xela_4.csv").write_text("".join(f"{','.join(map(str, row))}\n" for row in rows))
+    return folder
+
+
+def test_gains_belong_to_the_places_and_axes_of_the_mounting(tmp_path, capsys):
+    """Gains stay with their chips: a pad that is turned in the gripper reads the same contacts, elsewhere."""
+    turned = Mounting(orders()["turned by 90 degrees clockwise"], True, (1, -1, -1))
+    pads = []
+    for name, mounting in (("even", AS_WIRED), ("turned", turned)):
+        out = tmp_path / f"{name}.toml"
+        save_sensor_file(out, SensorFile(sensors={"4": SensorEntry(mounting)}))
+        identify.main([str(gripped(tmp_path / name, mounting)), "--out", str(out)])
+        pads.append(load_sensor_file(out).sensors["4"].pad)
+    assert pads[0].gains == pytest.approx(pads[1].gains, abs=1e-3) and np.ptp(pads[0].gains) > 0.05
+    assert capsys.readouterr().out.endswith("pads of 4\n")
+    (tmp_path / "even/trial/xela_4.csv").rename(tmp_path / "even/trial/xela_left.csv")
+    identify.main([str(tmp_path / "even"), "--out", str(tmp_path / "even.toml")])
+    assert capsys.readouterr().out.endswith("pads of left, which was not in it\n"), "no gains of sensor 4"
+
+
+def test_an_emulated_sensor_teaches_a_device_nothing_nor_the_other_way(tmp_path, capsys):
+    emulated = frozenset({"baseline"})
+    for name, entry, columns, told in (
+        ("device", SensorEntry(), ("emulated",), "is of an emulated sensor, expected one of a device"),
+        ("emulated", SensorEntry(emulated=emulated), (), "is of a device, expected one of an emulated sensor"),
+    ):
+        out, folder = tmp_path / f"{name}.toml", gripped(tmp_path / name, AS_WIRED, *columns)
+        save_sensor_file(out, SensorFile(sensors={"4": entry}))
+        before = out.read_bytes()
+        for more in ((), ("--ball-mm", "40")):
+            path = folder / "trial/xela_4.csv" if more else folder
+            with pytest.raises(SystemExit, match=rf"^train\.identify: [^\n]*xela_4.csv {told}[^\n]*doctor --out$"):
+                identify.main([str(path), "--out", str(out), *more])
+        assert out.read_bytes() == before
+    out = tmp_path / "practice.toml"
+    save_sensor_file(out, SensorFile(sensors={"4": SensorEntry(emulated=emulated)}))
+    identify.main([str(tmp_path / "device"), "--out", str(out)])
+    assert "pads of 4\n" in capsys.readouterr().out and load_sensor_file(out).sensors["4"].emulated == emulated
+
+
+def test_a_dead_taxel_is_one_line(tmp_path):
+    path = gripped(tmp_path) / "trial/xela_4.csv"
+    header, first, *rows = [line.split(",") for line in path.read_text().splitlines()]
+    stuck = [[*row[:15], *first[15:18], *row[18:]] for row in rows]
+    path.write_text("".join(f"{','.join(row)}\n" for row in [header, first, *stuck]))
+    with pytest.raises(SystemExit, match=r"^train\.identify: taxel 5 .* of xela_4 reads the same in all contacts, .*$"):
+        identify.main([str(tmp_path)])
+
+
+def test_a_pad_of_another_model_is_one_line(tmp_path):
+    folder, out = gripped(tmp_path / "grips"), tmp_path / "sensor.toml"
+    save_sensor_file(out, SensorFile("uSPa46", sensors={"4": SensorEntry(Mounting(taxel_count=24))}))
+    with pytest.raises(SystemExit, match=r"has 16 taxels, and 24 in the sensor file, expected the 16 of a uSPa44"):
+        identify.main([str(folder), "--out", str(out)])
+
+
+def test_a_pad_that_no_trial_lets_go_of_or_that_nothing_presses_is_one_line(tmp_path):
+    held = gripped(tmp_path / "held") / "trial/xela_4.csv"
+    rows = held.read_text().splitlines(keepends=True)
+    for lines, told in ((rows[:250], "lower than where .* let go of it"), (rows[:100], "nothing presses a pad")):
+        held.write_text("".join(lines))
+        with pytest.raises(SystemExit, match=rf"^train\.identify: [^\n]*{told}[^\n]*$"):
+            identify.main([str(held.parents[1]), "--out", str(tmp_path / "sensor.toml")])
+    assert not (tmp_path / "sensor.toml").exists()
 
 
 @pytest.mark.skipif(not recording_paths(FOLDER), reason=f"no real recordings at {FOLDER} (TACTILE_RECORDINGS)")

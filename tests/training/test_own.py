@@ -1,5 +1,7 @@
 """A model for one sensor: what is known of it, what its network is told, and whether it is handed over."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from edge_samples import make_contract, write_model
@@ -7,6 +9,8 @@ from press_samples import make_press_set
 
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
+from firmware_bridge.recording.csv_reader import csv_header
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -16,7 +20,7 @@ from train.data.press_batches import OneSensor, PressBatches
 from train.data.real_grips import Grip
 from train.data.world import World, solve_pad
 from train.errors import DatasetError
-from train.own import OWN, UNLIKE, compared, knowledge_of, main
+from train.own import OWN, REPLACED, UNLIKE, compared, knowledge_of, main
 from train.physics.pad_draws import KNOWN, RANGES
 from train.physics.sensor_noise import NAMES, Nuisances
 
@@ -28,6 +32,8 @@ THICK = Pad(
     gain_half_widths=(0.025,) * GAINS,
 )
 FILE = SensorFile(sensors={"4": SensorEntry(pad=THICK, counts_per_newton=1100.0)})
+BEYOND = SensorFile(sensors={"4": SensorEntry(pad=Pad(thickness_mm=50.0))})
+REHEARSED = SensorFile(sensors={"4": SensorEntry(counts_per_newton=1100.0, emulated=frozenset({"force"}))})
 
 
 def test_pads_are_drawn_as_wide_as_what_is_not_known():
@@ -96,8 +102,13 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     free = Grip("untouched", np.full((30, 3, 4, 4), 30_000), rest)
     _, objection, _ = compared(tiny, found, sets, [free])
     assert "in untouched nan% of its patterns have holes" in objection, "no pattern is no proof"
-    _, objection, _ = compared(ModelSession(find_model("stsr-int8")), found, sets, [])
+    bundled = ModelSession(find_model("stsr-int8"))
+    _, objection, _ = compared(bundled, found, sets, [])
     assert objection is not None and UNLIKE not in objection, "no worse there"
+    _, objection, _ = compared(tiny, found, sets, [], {REPLACED: bundled})
+    assert objection is not None and objection.count(f"to {REPLACED}") == 1, "the better one stays, by pads like it"
+    _, objection, _ = compared(bundled, found, sets, [], {REPLACED: bundled})
+    assert f"to {REPLACED}" not in objection, "the same one may be handed over again"
 
 
 @pytest.mark.parametrize(
@@ -105,12 +116,28 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     [
         (None, [], "sensor.toml"),
         (SensorFile(sensors={"4": SensorEntry()}), [], "nothing is known of this sensor, "),
+        (REHEARSED, [], "has force of an emulated sensor 4, .*: write one of your sensor with edge-sr doctor --out"),
+        (BEYOND, [], "thickness_mm of sensor 4 is 50, expected 3.1 to 7.2 of a pad that can be simulated: measure it"),
+        (
+            SensorFile("uSPa46", sensors={"4": SensorEntry(Mounting(taxel_count=24))}),
+            [],
+            "of a uSPa46, expected a uSPa44",
+        ),
+        (FILE, [], "nothing to compare it on: .* pass --recordings or --taps, or --without-recordings"),
+        (FILE, ["--beside", "x4.onnx"], "x4 is a model of 2 taps at x4, expected one of a single tap, or of several"),
         (FILE, ["--mesh", "none.stl"], "none.stl: cannot be read"),
-        (FILE, ["--recordings", "."], "no recordings of real sensors"),
+        (FILE, ["--recordings", "."], "holds no recordings: expected a folder of TRIAL/xela_SENSOR.csv"),
+        (FILE, ["--recordings", "free"], "nothing presses the pad in trial of free, expected a grip of a flat face"),
+        (FILE, ["--recordings", "played"], "xela_4.csv is of an emulated sensor, expected one of a device"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, held, options, told):
     monkeypatch.chdir(tmp_path)
+    write_model(Path("x4.onnx"), make_contract(scale=4, taps=2))
+    Path("played/trial").mkdir(parents=True)
+    Path("free/trial").mkdir(parents=True)
+    Path("free/trial/xela_4.csv").write_text(f"{','.join(csv_header())}\n{'30000,' * 47}30000\n")
+    Path("played/trial/xela_4.csv").write_text(f"{','.join(csv_header())},emulated\n{'30000,' * 48}1\n")
     if held is not None:
         save_sensor_file(tmp_path / "sensor.toml", held)
     with pytest.raises(SystemExit, match=rf"^train\.own: [^\n]*{told}[^\n]*$"):
@@ -124,7 +151,9 @@ def test_from_a_sensor_file_to_a_model(tmp_path, capsys, limits):
     save_sensor_file(tmp_path / "s.toml", FILE)
     for _ in range(2):
         with pytest.raises(SystemExit, match=r"^1$"):
-            main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--minutes", "0.01"])
+            main(
+                [str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--minutes", "0.01", "--without-recordings"]
+            )
         assert "not handed over: " in capsys.readouterr().out
     assert not (tmp_path / "mine/mine.onnx").exists()
     contract = ModelSession(tmp_path / "mine/work/mine-int8.onnx").contract

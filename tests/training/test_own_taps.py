@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 import shapely
 import tapping_robot
+from bridge_samples import write_npz
 from edge_samples import make_contract, write_model
+from matplotlib.image import imsave
 from press_samples import make_press_set
 from tapping_robot import Robot, plate_mesh
 
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
-from firmware_bridge.sensor_file.model import load_sensor_file
+from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import own, taps
 from train.data import recorded_taps
 from train.data.press_batches import OneSensor, PressBatches, with_own_taps
@@ -22,7 +25,7 @@ from train.errors import DatasetError
 from train.networks.compact import HeteroscedasticError
 from train.own import OWN, TAPPED, compared, knowledge_of
 from train.physics.gripped import FINE_SCALE, GrippedPad
-from train.physics.pad_draws import KNOWN, NOMINAL
+from train.physics.pad_draws import KNOWN, NOMINAL, constants
 from train.physics.tpsf import resample
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import figure
@@ -95,6 +98,7 @@ def test_other_truths_are_there_to_compare(tapped, capsys, truth):
         (lambda row: [*row[:-3], "500", *row[-2:]], None, "the pad never touches the surface at a pose"),
         (list, 900, "places, expected at least 27"),
         (list, 99, "has no tap with a pose"),
+        (lambda row: [row[0], *(str(4 * int(n) - 99_000) for n in row[1:-3]), *row[-3:]], None, "is .* mm deep by"),
     ],
 )
 def test_a_bad_recording_is_one_line(tapped, tmp_path, change, lines, complaint):
@@ -106,14 +110,25 @@ def test_a_bad_recording_is_one_line(tapped, tmp_path, change, lines, complaint)
         taps.main(arguments(folder, recording=tmp_path / "bad.csv"))
 
 
+def test_a_recording_of_another_sensor_is_one_line(tapped, tmp_path):
+    path = write_npz(tmp_path / "other.npz", np.full((200, 3, 4, 4), 30_000), sensors=["6"] * 200)
+    with pytest.raises(SystemExit, match=r"^train\.taps: .*other.npz has the sensors 6, none of them 4$"):
+        taps.main(arguments(tapped[0], recording=path))
+
+
 def test_a_bad_surface_is_one_line(tapped, tmp_path):
     plate_mesh(FIGURES).apply_scale(0.001).export(tmp_path / "metres.stl")
     (tmp_path / "broken.png").write_bytes(b"no picture")
+    imsave(tmp_path / "even.png", np.zeros((2, 2)))
+    even = (tmp_path / "even.png").read_bytes()
+    (tmp_path / "huge.png").write_bytes(even[:16] + 2 * (60_000).to_bytes(4) + even[24:])
     for surface, complaint in (
         ("metres.stl", "pass --unit-mm 1000 if it is in metres"),
         ("none.stl", "cannot be read"),
         ("broken.png", "is no PNG file"),
         ("none.png", "No such file"),
+        ("even.png", "even.png: all pixels are alike, expected figures that are brighter"),
+        ("huge.png", "3600000000 pixels, at most 50000000 are read"),
     ):
         with pytest.raises(SystemExit, match=rf"^train\.taps: .*{complaint}[^\n]*$"):
             taps.main(arguments(tapped[0], surface=tmp_path / surface))
@@ -223,13 +238,13 @@ def test_what_loses_on_own_taps_is_not_handed_over(tapped, tmp_path):
     folder, _ = tapped
     taps.main(arguments(folder))
     found = knowledge_of(load_sensor_file(folder / "sensor.toml"), None)
-    parts = load_tap_parts(folder / "taps.npz", "4", found.pad)
+    parts = load_tap_parts(folder / "taps.npz", "4", found.pad, constants(found.middle()))
     assert set(parts) == {"training", "validation", "test"} and len(np.unique(parts["test"].pad)) == 3
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
     bundled = ModelSession(find_model("stsr-int8"))
-    table, objection, _ = compared(tiny, found, {TAPPED: parts["test"]}, [], [bundled])
+    table, objection, _ = compared(tiny, found, {TAPPED: parts["test"]}, [], {bundled.name: bundled})
     assert OWN in table and objection is not None and f"on {TAPPED} it is -" in objection
-    _, objection, _ = compared(bundled, found, {TAPPED: parts["test"]}, [], [tiny])
+    _, objection, _ = compared(bundled, found, {TAPPED: parts["test"]}, [], {"tiny": tiny})
     assert objection is not None and "to tiny" not in objection, "better than tiny, and no better than itself"
 
 
@@ -238,13 +253,21 @@ def test_taps_of_another_sensor_or_of_none_are_refused(tapped, tmp_path):
     found = knowledge_of(load_sensor_file(folder / "sensor.toml"), None)
     make_press_set().save(tmp_path / "presses.npz")
     with pytest.raises(DatasetError, match="has no poses that are held out"):
-        load_tap_parts(tmp_path / "presses.npz", "4", found.pad)
+        load_tap_parts(tmp_path / "presses.npz", "4", found.pad, constants(found.middle()))
     for config, complaint in (({"sensor": "6"}, "has taps of sensor 6, expected 4"), ({"sensor": "4"}, "at x2")):
         made = make_press_set()
         maps = {name: getattr(made, name)[:, ::5, ::5] for name in ("patterns", "touching")}
         replace(made, config=config | {"split": {}}, **maps).save(tmp_path / "presses.npz")
         with pytest.raises(DatasetError, match=complaint):
-            load_tap_parts(tmp_path / "presses.npz", "4", found.pad)
+            load_tap_parts(tmp_path / "presses.npz", "4", found.pad, constants(found.middle()))
+    taps.main(arguments(folder))
+    entry = load_sensor_file(folder / "sensor.toml").sensors["4"]
+    corrected = replace(entry, pad=replace(entry.pad, thickness_mm=5.0, intervals={}))
+    save_sensor_file(tmp_path / "corrected.toml", SensorFile(sensors={"4": corrected}))
+    with pytest.raises(SystemExit, match=r"has other constants of the pad than the sensor file: make it again"):
+        own.main(
+            [str(tmp_path / "corrected.toml"), "--taps", str(folder / "taps.npz"), "--out", str(tmp_path / "mine")]
+        )
 
 
 @pytest.mark.night

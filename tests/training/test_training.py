@@ -164,6 +164,38 @@ def test_what_cannot_be_trained_is_said_in_one_line(data, tmp_path, options, tol
         main([str(tmp_path), *given, *options, "--steps", "1"])
 
 
+def test_presses_that_do_not_belong_together_are_refused_before_the_training(data, tmp_path):
+    data.save(tmp_path / "data.npz")
+    coarse = {name: getattr(data, name)[:, ::5, ::5] for name in ("patterns", "touching")}
+    replace(data, **coarse).save(tmp_path / "coarse.npz")
+    data.with_taps(1).save(tmp_path / "single.npz")
+    replace(data, poses=data.poses + 1).save(tmp_path / "moved.npz")
+    refused = {
+        "single": r"has 48 sequences of 1 taps that are only turned, .*; expected some of 2 taps, at x10 of 4 x 4 as",
+        "moved": "has 0 sequences of 2 taps that are only turned",
+        "coarse": "at x2 of 4 x 4 taxels; expected some of 2 taps, at x10 of 4 x 4",
+    }
+    options = ["--network", "compact-mtsr2", "--steps", "1"]
+    for name, told in refused.items():
+        files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / f"{name}.npz")]
+        with pytest.raises(SystemExit, match=rf"^fit: the validation set [^\n]*{told}[^\n]*$"):
+            main([str(tmp_path), *files, *options])
+    files = ["--data", str(tmp_path / "data.npz"), str(tmp_path / "coarse.npz"), "--validation", files[-1]]
+    with pytest.raises(SystemExit, match=r"^fit: the presses are at x10 of 4 x 4 taxels and x2 of 4 x 4 taxels, .*$"):
+        main([str(tmp_path), *files, *options])
+
+
+def test_a_full_disk_is_one_line(data, tmp_path):
+    """A file can be 64 kB long at most, as where the disk is full: torch itself would end with a traceback."""
+    data.save(tmp_path / "data.npz")
+    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))"
+    words = ["--data", "data.npz", "--validation", "data.npz", "--network", "small-stsr", "--steps", "1"]
+    command = [sys.executable, "-c", f"{full}; from train.fit import main; main()", "mine", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    told = "fit: mine/small-stsr.pt cannot be written: File too large; make room, and the same command continues\n"
+    assert (done.returncode, done.stderr) == (1, told)
+
+
 RECIPE = Recipe(steps=12, batch=4, learning_rate=1e-2)
 
 

@@ -89,6 +89,7 @@ def test_what_was_made_otherwise_is_not_overwritten(small, tmp_path):
         DatasetError, match=r"other\.npz\.parts holds parts that were made with other settings: delete it"
     ):
         make_presses(replace(SMALL, count=5, seed=6), tmp_path / "other.npz")
+    assert len([*(tmp_path / "other.npz.parts").iterdir()]) == 1, "before the others are made"
 
 
 def test_a_narrow_mesh_is_pressed_as_often_as_asked(tmp_path, capsys):

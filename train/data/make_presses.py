@@ -50,6 +50,8 @@ def make_presses(world: World, path: Path) -> PressSet:
     except OSError as error:
         raise DatasetError(f"{folder} cannot be made: {error.strerror}") from error
     missing = [number for number in range(world.chunks) if not _part(folder, number).exists()]
+    if any(load_presses(_part(folder, number)).config != facts for number in {*range(world.chunks)} - {*missing}):
+        raise DatasetError(f"{folder} holds parts that were made with other settings: delete it")
     with progress("pads", world.chunks, "pad", done=world.chunks - len(missing)) as bar:
         pool = joblib.Parallel()
         for start in range(0, len(missing), _AT_ONCE):
@@ -59,8 +61,6 @@ def make_presses(world: World, path: Path) -> PressSet:
                 replace(part, config=facts).save(_part(folder, number))
                 bar.update()
     parts = [load_presses(_part(folder, number)) for number in range(world.chunks)]
-    if any(part.config != facts for part in parts):
-        raise DatasetError(f"{folder} holds parts that were made with other settings: delete it")
     if not any(len(part) for part in parts):
         raise DatasetError(f"every press of {path} came out lighter than {LEAST_FORCE_N} N: ask for more of them")
     made = replace(join_presses(parts), config=facts)

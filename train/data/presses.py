@@ -184,10 +184,14 @@ def load_presses(path: Path) -> PressSet:
 def join_presses(parts: Sequence[PressSet]) -> PressSet:
     """Concatenate sequences, padded to the taps of the longest; pads are renumbered, so that they stay distinct.
 
-    DatasetError if there are none.
+    DatasetError if there are none, or of several scales or pads.
     """
     if not parts:
         raise DatasetError("no presses to join: name at least one file")
+    kinds = dict.fromkeys((part.scale, *part.counts.shape[3:]) for part in parts)
+    if len(kinds) > 1:
+        listed = " and ".join(f"x{scale} of {rows} x {cols} taxels" for scale, rows, cols in kinds)
+        raise DatasetError(f"the presses are at {listed}, expected one scale and one pad: name files that are alike")
     taps = max(part.taps for part in parts)
     first, pads = 0, []
     for part in parts:

@@ -11,14 +11,17 @@ from scipy.ndimage import binary_fill_holes
 
 from edge.inference.bundled import TAXELS
 from edge.inference.onnx_session import ModelSession
-from edge.perception.contact_options import RuntimeOptions
+from edge.perception.contact_options import ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import load_estimator
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.tracks import Recording, Track
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from train.errors import DatasetError
 from train.physics.sensor_noise import neighbours
@@ -26,6 +29,8 @@ from train.physics.sensor_noise import neighbours
 REST_SCANS: Final = 20  # scans at the end of a recording, where one of the grips has been released
 _TAXELS: Final = USPA44.taxel_count
 _Z: Final = AXES.index("z")
+_AS_WIRED: Final = Mounting()
+_UNKNOWN: Final = SensorFile()
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +38,13 @@ class Grip:
     """Raw recording of one sensor in one trial, whose scans are not independent."""
 
     trial: str
-    counts: NDArray[np.integer]  # (n, 3, rows, cols) raw
+    counts: NDArray[np.integer]  # (n, 3, rows, cols) raw, each taxel in its place
     free: Baseline  # of the sensor's free pad
+    mounting: Mounting = _AS_WIRED  # by which its axes are turned
+
+    def zeroed(self) -> NDArray[np.float32]:
+        """Return the scans over the free pad, along the pad's axes."""
+        return np.stack([deformation(scan, self.free, self.mounting) for scan in self.counts])
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,34 +77,80 @@ def recording_paths(folder: Path) -> list[Path]:
     return sorted(folder.glob("*/xela_*.csv"))
 
 
-def recorded_grips(folder: Path) -> list[Grip]:
-    """Load the recordings of real sensors, each with its sensor's rest level.
+def check_track(recording: Recording, track: Track, entry: SensorEntry) -> None:
+    """Refuse what would teach something wrong of a sensor that the sensor file has as `entry`.
+
+    Raises:
+        DatasetError: its pad is of another model, or only one of recording and file is of an emulated sensor.
+    """
+    if track.geometry != USPA44 or entry.mounting.taxel_count != USPA44.taxel_count:
+        got = f"{track.geometry.taxel_count} taxels, and {entry.mounting.taxel_count} in the sensor file"
+        raise DatasetError(f"{recording.path} has {got}, expected the {USPA44.taxel_count} of a {USPA44.name} in both")
+    if (recording.origin == "emulated") == bool(entry.emulated):
+        return
+    of, expected = ("a device", "an emulated sensor") if entry.emulated else ("an emulated sensor", "a device")
+    raise DatasetError(
+        f"{recording.path} is of {of}, expected one of {expected} as in the sensor file: pass a recording of the same "
+        "sensor, or write a file of it with edge-sr doctor --out"
+    )
+
+
+def recorded_grips(folder: Path, known: SensorFile = _UNKNOWN) -> list[Grip]:
+    """Load the recordings of sensors as a sensor file has them mounted, each with its sensor's rest level.
 
     The rest level is taken from the end of the trial that ends with the least load: there the grip was released.
-    DatasetError if there are none, or one cannot be read.
+    DatasetError if there are none, or one cannot be read or is not of such a sensor.
     """
     paths = recording_paths(folder)
     if not paths:
-        raise DatasetError("no recordings of real sensors: set TACTILE_RECORDINGS to a folder of TRIAL/xela_SENSOR.csv")
-    try:
-        counts = {path: load_recording(path).tracks[0].counts for path in paths}
-    except RecordingError as error:
-        raise DatasetError(str(error)) from error
+        raise DatasetError(
+            f"{folder} holds no recordings: expected a folder of TRIAL/xela_SENSOR.csv; of an experiment it is "
+            "TACTILE_RECORDINGS"
+        )
     grips: list[Grip] = []
     for sensor in dict.fromkeys(path.stem for path in paths):
-        mine = [path for path in paths if path.stem == sensor]
-        free = min(mine, key=lambda path: float(counts[path][-REST_SCANS:, _Z].mean()))
-        rest = Baseline.from_counts(sensor, counts[free][-REST_SCANS:], created_unix_s=0.0)
-        grips += [Grip(path.parent.name, counts[path], rest) for path in mine]
+        entry = known.sensors.get(sensor.removeprefix("xela_"), SensorEntry())
+        counts = {path: _placed_counts(path, entry) for path in paths if path.stem == sensor}
+        ends = {path: entry.mounting.signs[_Z] * float(read[-REST_SCANS:, _Z].mean()) for path, read in counts.items()}
+        last = min(ends, key=ends.__getitem__)
+        rest = Baseline.from_counts(sensor, counts[last][-REST_SCANS:], created_unix_s=0.0)
+        for path, read in counts.items():
+            grips.append(Grip(path.parent.name, read, rest, entry.mounting))
+            if (freer := -grips[-1].zeroed()[:, _Z].sum(axis=(1, 2)).min()) > ON_COUNTS:
+                raise DatasetError(
+                    f"in {path} the summed z is up to {freer:.0f} counts lower than where {last} ends, expected a free "
+                    "pad there: let go of it before a recording ends"
+                )
     return grips
 
 
-def recorded_sets(folder: Path) -> list[ScanSet]:
+def grips_of(folder: Path, sensor: str, known: SensorFile) -> list[Grip]:
+    """Return the recordings of one sensor, as of `recorded_grips`; DatasetError if one is of a free pad alone."""
+    grips = [one for one in recorded_grips(folder, known) if one.free.sensor.removeprefix("xela_") == sensor]
+    if not grips:
+        raise DatasetError(f"{folder} has no recording xela_{sensor}.csv of this sensor")
+    for one in grips:
+        if not loaded(one.zeroed()).any():
+            raise DatasetError(f"nothing presses the pad in {one.trial} of {folder}, expected a grip of a flat face")
+    return grips
+
+
+def _placed_counts(path: Path, entry: SensorEntry) -> NDArray[np.integer]:
+    """Return the raw counts of a CSV, whose taxels are in the order of the id map, with each taxel in its place."""
+    try:
+        recording = load_recording(path)
+    except RecordingError as error:
+        raise DatasetError(str(error)) from error
+    check_track(recording, recording.tracks[0], entry)
+    return entry.mounting.place_counts(recording.tracks[0].counts)
+
+
+def recorded_sets(folder: Path, known: SensorFile = _UNKNOWN) -> list[ScanSet]:
     """Return real scans under load, one set for each trial and sensor; repeated scans are left out."""
     sets: list[ScanSet] = []
-    for grip in recorded_grips(folder):
+    for grip in recorded_grips(folder, known):
         renewed = np.append(True, (np.diff(grip.counts, axis=0) != 0).any(axis=(1, 2, 3)))
-        zeroed = deformation(grip.counts[renewed], grip.free)
+        zeroed = grip.zeroed()[renewed]
         sets.append(ScanSet(grip.free.sensor, grip.trial, zeroed[loaded(zeroed)]))
     return [scans for scans in sets if len(scans.counts)]
 
@@ -120,8 +176,10 @@ def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | 
     """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred."""
     name = grip.free.sensor
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
-    options, free = RuntimeOptions(every_scan=True), {name: grip.free}
-    runtime = Runtime(model, source="replay", estimator=estimator, baselines=free, pad=pad, options=options)
+    options, free, mounted = RuntimeOptions(every_scan=True), {name: grip.free}, {name: grip.mounting}
+    runtime = Runtime(
+        model, source="replay", estimator=estimator, baselines=free, mountings=mounted, pad=pad, options=options
+    )
     series = ScanSeries(name, USPA44)
     none = np.full(model.contract.pattern_shape, np.nan, dtype=np.float32)
     patterns, believed = [], []
@@ -131,7 +189,7 @@ def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | 
         result = runtime.push(series.close(raw, number * 16_750_000))
         patterns.append(none if result.pattern is None else result.pattern)
         believed.append(result.trusted is not False)
-    zeroed = (grip.counts - grip.free.counts).astype(np.float32)
+    zeroed = grip.zeroed()
     here = loaded(zeroed)
     return Played(zeroed[here], np.stack(patterns)[here], np.array(believed)[here])
 

@@ -34,6 +34,7 @@ from firmware_bridge.sensor_file.model import SensorEntry
 from firmware_bridge.zeroing.baseline import deformation
 from firmware_bridge.zeroing.free_stretch import free_stretch
 from train.data.presses import PressSet, load_presses
+from train.data.real_grips import check_track
 from train.errors import DatasetError, SurfaceError
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM, SAMPLES, SCALE, GrippedPad, Taps
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, depth_image
@@ -42,6 +43,7 @@ from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM
 from train.surfaces.poses import over_surface
 
 MOST_BYTES: Final = 1 << 30  # largest file of published taps that is read
+MOST_PIXELS: Final = 50_000_000  # of a depth image: its plate is 0.7 m wide at 0.1 mm a pixel
 _FREE: Final = 10  # scans before a tap from which it is zeroed
 _TOUCH: Final = 0.02  # share of a tap's peak, in summed z, at which a free pad ends
 
@@ -83,8 +85,8 @@ def recorded_presses(
 ) -> list[tuple[NDArray[np.float32], PadPose | None]]:
     """Return the rising scans (frames, 3, rows, cols) of each press on one sensor, and its pose where it has one.
 
-    The scans are over the pad that was free before. BaselineRefusedError or DatasetError if the sensor is not there, or
-    the pad is never free.
+    The scans are over the pad that was free before. BaselineRefusedError or DatasetError if the sensor is not there or
+    another one, or the pad is never free.
     """
     track, counts = _zeroed(recording, entry, sensor)
     times = track.time_ns if track.time_ns is not None and not recording.poses_by_row else np.arange(len(counts))
@@ -102,20 +104,22 @@ def recorded_presses(
 def _zeroed(recording: Recording, entry: SensorEntry, sensor: str) -> tuple[Track, NDArray[np.float32]]:
     """Return the track of a sensor, and its scans (n, 3, rows, cols) over its free pad."""
     tracks = {track.sensor: track for track in recording.tracks}
-    track = recording.tracks[0] if len(tracks) == 1 else tracks.get(sensor)
+    is_csv = recording.path.suffix.lower() == ".csv"
+    track = recording.tracks[0] if is_csv else tracks.get(sensor)  # a CSV does not state its sensor
     if track is None:
         raise DatasetError(f"{recording.path} has the sensors {', '.join(tracks)}, none of them {sensor}")
-    is_csv = recording.path.suffix.lower() == ".csv"
+    check_track(recording, track, entry)
     raw = entry.mounting.place_counts(track.counts) if is_csv else track.counts
     rest = free_stretch(raw).baseline(track.sensor, np.nan)
     mounting = recording.mountings.get(track.sensor, entry.mounting)
     return track, np.nan_to_num(np.stack([deformation(scan, rest, mounting) for scan in raw]))
 
 
-def load_tap_parts(path: Path, sensor: str, pad: SensorPad) -> dict[str, PressSet]:
+def load_tap_parts(path: Path, sensor: str, pad: SensorPad, made_with: NDArray[np.float32]) -> dict[str, PressSet]:
     """Return a sensor's taps by part (training, validation, test), divided by its gains as in the runtime.
 
-    DatasetError if it is no file of train.taps, or one of another sensor or scale.
+    DatasetError if it is no file of train.taps, or one of another sensor or scale, or with other constants than
+    `made_with`, over their spread, by more than a twentieth of a range: how deep the pad was pressed follows from them.
     """
     taps = load_presses(path)
     if "split" not in taps.config:
@@ -124,6 +128,8 @@ def load_tap_parts(path: Path, sensor: str, pad: SensorPad) -> dict[str, PressSe
         raise DatasetError(f"{path} has taps of sensor {taps.config['sensor']}, expected {sensor}")
     if taps.scale != SCALE:
         raise DatasetError(f"{path} has patterns at x{taps.scale}, expected x{SCALE}: make it with --scale {SCALE}")
+    if np.abs(taps.constants - made_with).max() > 0.1:
+        raise DatasetError(f"{path} has other constants of the pad than the sensor file: make it again with train.taps")
     if pad.gains is not None:
         taps = replace(taps, counts=(taps.counts / np.reshape(pad.gains, taps.counts.shape[2:])).astype(np.float32))
     return {part: taps.pick(np.isin(taps.pad, numbers)) for part, numbers in taps.config["split"].items()}
@@ -251,10 +257,17 @@ def surface_of(path: Path, unit_mm: float = 1.0, pixel_mm: float = 0.1) -> Surfa
     from matplotlib.image import imread  # of the development environment alone, and meshes do without
 
     try:
+        with path.open("rb") as file:
+            head = file.read(24)
+        if (pixels := int.from_bytes(head[16:20]) * int.from_bytes(head[20:])) > MOST_PIXELS:
+            raise ValueError(f"{pixels} pixels, at most {MOST_PIXELS} are read")
         image = imread(path)
-    except (ValueError, SyntaxError) as error:
+    except (OSError, ValueError, SyntaxError) as error:
         raise DatasetError(f"{path} is no PNG file, or a damaged one: {error}") from error
-    return image_surface(image if image.ndim == 2 else image[..., :3].mean(axis=2), pixel_mm)
+    image = image if image.ndim == 2 else image[..., :3].mean(axis=2)
+    if not np.ptp(image) > 0:
+        raise DatasetError(f"{path}: all pixels are alike, expected figures that are brighter than the rest")
+    return image_surface(image, pixel_mm)
 
 
 def image_surface(image: NDArray[np.floating], pixel_mm: float) -> Surface:

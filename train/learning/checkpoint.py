@@ -26,7 +26,16 @@ from train.data.press_batches import Batch, OneSensor, PosedBatches, PressBatche
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
 from train.learning.interval_fit import calibrate, interval_coverage
-from train.learning.training_loop import DAMAGES, Recipe, device_of_rank, rank_and_world, reason, train, wait_for_all
+from train.learning.training_loop import (
+    DAMAGES,
+    Recipe,
+    device_of_rank,
+    rank_and_world,
+    reason,
+    train,
+    wait_for_all,
+    write_state,
+)
 from train.networks.blocks import Objective, PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.named_networks import build, grown
@@ -101,6 +110,7 @@ def fit_network(
     batches = batches_of(data, training.scale, recipe, seed, posed=net.takes_poses, sensor=training.sensor)
     if taps is not None and training.sensor is not None:
         batches = with_own_taps(batches, taps, training.sensor, seed)
+    _check_validation(validation, data, net.taps)
     elapsed_s = train(
         net,
         _objective(net, device, seed),
@@ -133,14 +143,24 @@ def fit_network(
     }
     if rank == 0:
         # The report is written last, so that it never describes weights that do not exist.
-        weights, text = net.state_dict(), json.dumps(report, indent=1) + "\n"
-        write_in_place(
-            path, lambda draft: torch.save(weights, draft), lambda draft: torch.load(draft, weights_only=True)
-        )
+        text = json.dumps(report, indent=1) + "\n"
+        write_state(path, net.state_dict())
         write_in_place(path.with_suffix(".json"), lambda draft: draft.write_text(text), lambda draft: draft.read_text())
         resume_path.unlink(missing_ok=True)
     wait_for_all()
     return report
+
+
+def _check_validation(validation: FrozenSet, data: PressSet, taps: int) -> None:
+    """Raise a DatasetError where a network cannot be evaluated on a set, before it is trained."""
+    got, expected = (validation.scale, *validation.newest.shape[2:]), (data.scale, *data.counts.shape[3:])
+    there = 1 + validation.earlier.shape[1]
+    if got != expected or there < taps or not len(validation):
+        raise DatasetError(
+            f"the validation set has {len(validation)} sequences of {there} taps that are only turned, at x{got[0]} of "
+            f"{got[1]} x {got[2]} taxels; expected some of {taps} taps, at x{expected[0]} of {expected[1]} x "
+            f"{expected[2]} as the presses: make others with train.data.make_presses"
+        )
 
 
 def batches_of(

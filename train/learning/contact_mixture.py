@@ -18,7 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from edge.perception.gain_learning import LARGEST_COUNTS, LEAST_COUNTS, ContactModel, GainLearner
+from edge.perception.gain_learning import (
+    LARGEST_COUNTS,
+    LEAST_COUNTS,
+    ContactModel,
+    GainLearner,
+    load_contact_model,
+)
+from firmware_bridge.in_place import check_writable, write_in_place
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.pad_constants import LEVEL_90
 from train.data.make_presses import make_presses, quiet_workers
@@ -265,6 +272,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path, metavar="OUT.npz")
     options = parser.parse_args(arguments)
     with ended_by_errors("train.learning.contact_mixture"):
+        check_writable(options.out)  # before minutes are spent on it
         mixture = fit_mixture(load_presses(options.presses))
         with quiet_workers():
             presses = make_presses(CALIBRATION, options.presses.with_name("calibration.npz"))
@@ -275,19 +283,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def write_model(path: Path, mixture: ContactMixture, model: ContactModel) -> None:
     """Write the model as edge.perception.gain_learning reads it, in half precision."""
     factors = np.linalg.inv(np.linalg.cholesky(mixture.covariances))
-    np.savez_compressed(
-        path,
-        allow_pickle=False,
-        share=mixture.share.astype(np.float32),
-        means=mixture.means.astype(np.float16),
-        factors=factors.astype(np.float16),
-        widening=np.float32(model.widening),
-        names=np.array([name for name, _, _ in model.constants]),
-        middles=np.array([middle for _, middle, _ in model.constants]),
-        halves=np.array([half for _, _, half in model.constants]),
-        constant_widening=np.float32(model.constant_widening),
-        bias=model.bias.astype(np.float32),
-    )
+    arrays = {
+        "share": mixture.share.astype(np.float32),
+        "means": mixture.means.astype(np.float16),
+        "factors": factors.astype(np.float16),
+        "widening": np.float32(model.widening),
+        "names": np.array([name for name, _, _ in model.constants]),
+        "middles": np.array([middle for _, middle, _ in model.constants]),
+        "halves": np.array([half for _, _, half in model.constants]),
+        "constant_widening": np.float32(model.constant_widening),
+        "bias": model.bias.astype(np.float32),
+    }
+    write_in_place(path, lambda draft: np.savez_compressed(draft, allow_pickle=False, **arrays), load_contact_model)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ process up to the order of additions, except for batch normalisation, which sees
 """
 
 import hashlib
+import io
 import json
 import os
 import time
@@ -243,9 +244,20 @@ def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: 
 def _keep(path: Path, parts: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
     """Keep the state of a run on disk, so that an interruption costs at most a minute."""
     state = {name: part.state_dict() for name, part in parts.items()} | dict(facts)
-    write_in_place(
-        path,
-        lambda draft: torch.save(state, draft),
-        lambda draft: torch.load(draft, map_location="cpu", weights_only=True),
-        keep_before=False,
-    )
+    write_state(path, state, keep_before=False)
+
+
+def write_state(path: Path, state: Mapping[str, Any], *, keep_before: bool = True) -> None:
+    """Write weights, or the state of a run, in place; CheckpointError if they cannot be written."""
+    held = io.BytesIO()  # torch tells neither the file nor the reason where it cannot write one itself
+    torch.save(state, held)
+    try:
+        write_in_place(
+            path,
+            lambda draft: draft.write_bytes(held.getbuffer()),
+            lambda draft: torch.load(draft, map_location="cpu", weights_only=True),
+            keep_before=keep_before,
+        )
+    except OSError as error:
+        why = f"{error.strerror or error}; make room, and the same command continues"
+        raise CheckpointError(f"{path} cannot be written: {why}") from error

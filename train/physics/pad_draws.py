@@ -105,6 +105,13 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
 }
 """Bounds of the constants that are drawn uniformly; docs/train.md has the reason for each."""
 
+SIMULATED: Final = {name: (max(2 * least - most, 0.0), 2 * most - least) for name, (least, most) in RANGES.items()} | {
+    "thickness_mm": (3.1, 7.2),
+    "poisson": (0.31, 0.4999),
+    "magnet_height_mm": (2.0, 3.0),
+}
+"""Bounds of constants of pads that can be simulated: magnets stay within the layer, and above their chips."""
+
 INPUTS: Final = tuple(RANGES)[:6]
 """Constants that a network takes as optional inputs: all but the pitch and the free sides."""
 
