@@ -226,14 +226,14 @@ def saturated(pad, counts, press=PRESS, **changes):
 
 class TestRuntime:
     def test_one_silent_taxel_spoils_no_zeroing_but_half_of_them_do(self):
-        pad = Pushed(make_runtime(baselines=None), noise=4)
+        pad = Pushed(make_runtime(baselines={}), noise=4)
         states = [pad.push(absent=(0,)).state for _ in range(TAXEL_SILENT_SCANS + 100)]
         assert states == ["zeroing"] * (TAXEL_SILENT_SCANS + 98) + ["incomplete"] * 2
         np.testing.assert_array_equal(np.flatnonzero(np.isnan(pad.results[-1].baseline.counts[2])), [0])
         back = [pad.push() for _ in range(2 * BACK_SCANS)][-1]
         assert (back.state, back.dead) == ("incomplete", {0: "unzeroed"})
         assert back.note == "no pattern, taxel 0 not zeroed: zero again"
-        pad = Pushed(make_runtime(baselines=None), noise=4)
+        pad = Pushed(make_runtime(baselines={}), noise=4)
         assert {pad.push(absent=tuple(range(8))).state for _ in range(400)} == {"zeroing"}
 
     @pytest.mark.parametrize("stamped", [True, False])
