@@ -33,7 +33,8 @@ class Samples:
     def period_s(self) -> float:
         """Return the period from scan to scan, in [s]."""
         together = min(100, self.scans // 2)  # an adapter that delivers scans in bunches makes one meaningless
-        return float(np.median(self.time_s[together:] - self.time_s[:-together])) / together
+        period_s = float(np.median(self.time_s[together:] - self.time_s[:-together])) / together
+        return max(period_s, 1e-4)  # where a machine that stood still took most scans at once
 
     def lost(self) -> int:
         """Count the scans that never came, as a run does."""
