@@ -6,6 +6,7 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -15,10 +16,10 @@ from edge.errors import UsageError, WindowError
 from edge.inference.contract import Model
 from edge.inference.intervals import doubt
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
-from edge.perception.event import OLD_NS, UNCHECKED, EventKind, Untimed, age_notes, notes_on_missing
+from edge.perception.event import OLD_NS, UNCHECKED, Event, EventKind, age_notes, notes_on_missing
 from edge.perception.gain_learning import ContactModel, Learn
 from edge.perception.pattern_description import Describe
-from edge.perception.result import Estimate, LastPattern, Origin, Result, Step, Window
+from edge.perception.result import Estimate, LastPattern, Result, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taps import Taps
 from edge.perception.taxel_health import Health, TaxelEstimator
@@ -79,7 +80,7 @@ class Sensor:
             self._zeroing.use(baseline, age_s if age_s >= 0 else None, time_ns)
             self._doubt.begin(baseline.origin)
 
-    def follow(self, step: Step, track: PoseTrack | None, events: list[Untimed]) -> None:
+    def follow(self, step: Step, track: PoseTrack | None, events: list[Callable[[int], Event]]) -> None:
         """Pass the step of the sensor's next scan through the stages before the model; a window is due then, or none.
 
         It takes the events of all sensors with those of its own; `track` has the poses of its pad, None without.
@@ -98,7 +99,7 @@ class Sensor:
         if scan.time_ns - scan.not_before_ns > OLD_NS:
             step.notes = (*step.notes, *age_notes(scan))
         if events or self.events:
-            step.events = tuple(event.at(scan.time_ns) for event in (*events, *self.events))
+            step.events = tuple(event(scan.time_ns) for event in (*events, *self.events))
             events.clear()
             self.events.clear()
         if step.zeroed is None:
@@ -175,7 +176,7 @@ class Sensor:
 
     def report(self, kind: EventKind, detail: str = "") -> None:
         """Report an event with the sensor's next scan."""
-        self.events.append(Untimed(kind, self._name, detail))
+        self.events.append(partial(Event, kind=kind, sensor=self._name, detail=detail))
 
 
 def _of(name: str, setting: Any) -> Any:
@@ -235,14 +236,13 @@ class Runtime:
         self.trust = contract.read_trust()
         self.unposed = None if contract.takes_poses else self.model.name
         self.waiting: dict[str, tuple[Sensor, Step, Window]] = {}
-        self._origin = Origin(self.source, self.model.name, contract.output_unit)
         self._sensors: dict[str, Sensor] = {}
-        self._events: list[Untimed] = []
+        self._events: list[Callable[[int], Event]] = []
         self._tracks: dict[str | None, PoseTrack] = {}
 
     def __repr__(self) -> str:
         sensors = ", ".join(self._sensors) or "none so far"
-        return f"<Runtime of {self._origin.model}, {self._origin.source}, sensors: {sensors}>"
+        return f"<Runtime of {self.model.name}, {self.source}, sensors: {sensors}>"
 
     @property
     def expected(self) -> frozenset[str]:
@@ -259,7 +259,7 @@ class Runtime:
         """Forget the taps of every sensor, as for a new object, and report it as an event; zeroing stays."""
         for sensor in self._sensors.values():
             sensor.tracker.reset()
-        self._events.append(Untimed("reset"))
+        self._events.append(partial(Event, kind="reset", sensor=None))
 
     def zero(self, name: str | None = None, *, force: bool = False) -> None:
         """Zero a sensor or all from the next scans, also in contact if forced; an event reports the outcome.
@@ -272,7 +272,7 @@ class Runtime:
         if not chosen:
             sensors = ", ".join(sorted(self._sensors))
             why = f"no sensor {name}, there are {sensors}" if sensors else "no scan has arrived yet"
-            self._events.append(Untimed("refused", None, f"zeroing refused: {why}"))
+            self._events.append(partial(Event, kind="refused", sensor=None, detail=f"zeroing refused: {why}"))
 
     def pose(self, pose: PadPose, time_ns: int, sensor: str | None = None, *, holds: bool = False) -> bool:
         """Take a pose of a pad at a monotonic time in [ns]; False unless it is later than the one before.
@@ -313,7 +313,7 @@ class Runtime:
         sensor = self._sensors.get(name)
         if sensor is None:
             sensor = self._sensors[name] = Sensor(name, scan.time_ns, self)
-        step = Step(scan, self._origin)
+        step = Step(scan, self.source, self.model.name, self.model.contract.output_unit)
         # Without a pose of any pad, which is the rule, this is all that poses cost.
         track = (self._tracks.get(name) or self._tracks.get(None) or None) if self._tracks else None
         sensor.follow(step, track, self._events)

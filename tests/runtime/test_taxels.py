@@ -15,7 +15,7 @@ from edge.api import USPA44, Baseline, EdgeError, demo_recording
 from edge.inference.bundled import TAXELS
 from edge.perception import taxel_health as health
 from edge.perception.event import joined
-from edge.perception.result import Origin, Step
+from edge.perception.result import Step
 from edge.perception.taxel_health import (
     BACK_SCANS,
     FAR_SCANS,
@@ -37,7 +37,7 @@ SPHERE_SHARE = 0.030
 
 def followed(watch, scan, baseline):
     """Return the step of a scan after the stage."""
-    step = Step(scan, Origin("device", "m", "mm"))
+    step = Step(scan, "device", "m", "mm")
     watch(step, baseline)
     watch.fill(step)
     return step
