@@ -54,12 +54,12 @@ class Sensor:
         mounting, baseline = runtime.mountings.get(name), runtime.baselines.get(name)
         mounting = mounting if mounting is not None and mounting.turns_axes else None
         pad = _of(name, runtime.pad)
-        check = None if trust is None else PatternCheck(trust, contract, self.report)
-        self.events: list[Untimed] = []
+        self.events: list[Callable[[int], Event]] = []  # at the time of the next scan
         self.last: LastPattern | None = None
         self.pad = SensorPad(
-            contract, pad, _of(name, runtime.counts_per_newton), check, runtime.scale_intervals.get(name)
+            contract, trust, pad, _of(name, runtime.counts_per_newton), runtime.scale_intervals.get(name)
         )
+        check = None if trust is None else PatternCheck(trust, contract, self.pad, self.report)
         self._name = name
         self._received_ns: int | None = None
         self._check, self._options = check, options
@@ -69,11 +69,11 @@ class Sensor:
         self._zeroing = Zeroing(self.tracker, self._health, mounting, self.report, runtime.unix_time_s, notes)
         self._doubt = BaselineDoubt(options, geometry.taxel_count, self.report)
         self._taps = Taps(self.tracker, self._health, contract, options, self.report)
-        self._describe = Describe(contract, trust, geometry, self.pad)
+        self._describe = Describe(contract, geometry, self.pad)
         self.learn: Learn | None = None
         if runtime.contacts is not None and options.learn:
             measured = pad if runtime.measured is None else runtime.measured.get(name)
-            self.learn = Learn(runtime.contacts, measured, self.pad, self.report)
+            self.learn = Learn(runtime.contacts, measured, self.pad, check, self.report)
         if baseline is not None:
             age_s = baseline.age_s(runtime.unix_time_s())
             # A baseline from the future means that one of the two clocks was wrong.

@@ -216,9 +216,8 @@ class Loop:
         """Keep what was learned; there are no more results."""
         if self._keeper is not None:
             keeper, self._keeper = self._keeper, None
-            keeper.close()
-            if keeper.trouble is not None:
-                self._tell(Event(self._clock_ns(), "note", None, f"learned gains are not kept: {keeper.trouble}"))
+            if (trouble := keeper.close()) is not None:
+                self._tell(Event(self._clock_ns(), "note", None, f"learned gains are not kept: {trouble}"))
         self._tally()
         if self._sinks:
             troubles = [sink.trouble for sink in self._sinks if sink.trouble is not None]
