@@ -134,7 +134,6 @@ class LiveView:
         self._socket = listen(host, port)
         self._thread: threading.Thread | None = None
         self._viewers: dict[ServerConnection, Viewer] = {}
-        self._watched = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._news = asyncio.Event()
         self._ending = False
@@ -187,7 +186,7 @@ class LiveView:
         self._snapshot.truth_of = truth_of
 
     def _wake_if_watched(self) -> None:
-        if self._watched:
+        if self._viewers:
             self._wake()
 
     def _wake(self) -> None:
@@ -200,7 +199,7 @@ class LiveView:
         try:
             asyncio.run(self._show(first, ready))
         finally:  # also after an unforeseen error, which ends this thread and not the run
-            self._loop, self._watched = None, False
+            self._loop = None
             ready.set()
             if not self._ending:
                 why = f"the live page has ended: {sys.exception()!r}; the run continues"
@@ -247,7 +246,8 @@ class LiveView:
         headers = request.headers
         refusal = self._access.refusal(request.path, headers.get_all("Host"), headers.get_all("Origin"))
         if refusal is not None:
-            return connection.respond(refusal.status, refusal.text + "\n")
+            status, why = refusal
+            return connection.respond(status, f"{why}\n")
         if request.path.partition("?")[0] == SOCKET:
             return None
         return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(self._page.headers), self._page.body)
@@ -257,7 +257,6 @@ class LiveView:
             await connection.close(CloseCode.TRY_AGAIN_LATER, f"too many viewers ({MOST_VIEWERS}): close one")
             return
         viewer = self._viewers[connection] = Viewer()
-        self._watched = True
         self._looked_at.set()
         broadcast([connection], first)
         self._news.set()
@@ -274,7 +273,6 @@ class LiveView:
             pass
         finally:
             del self._viewers[connection]
-            self._watched = bool(self._viewers)
             pinging.cancel()
             self._news.set()
 
