@@ -104,7 +104,8 @@ class TapTracker:
         """Take one scan of zeroed counts (3, rows, cols).
 
         The idle time is measured between scans, from the last one in contact. Time that runs backwards counts as no
-        time; a gap within a tap does not end the tap. A doubted scan is no contact, whatever its z.
+        time; a gap within a tap does not end the tap. A scan that is doubted, by `BaselineDoubt` of zeroing.py, is no
+        contact, whatever its z: this ends a tap where a pad rests.
         """
         z_counts = float(deformation[2].sum()) if z_counts is None else z_counts
         if self.contact:

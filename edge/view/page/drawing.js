@@ -22,9 +22,9 @@ function colourTable(name) {
   return table;
 }
 
-const VIRIDIS = colourTable("viridis");
-const CIVIDIS = colourTable("cividis");
-const MAGMA = colourTable("magma");
+const PATTERN_COLOURS = colourTable("viridis");
+const TAXEL_COLOURS = colourTable("cividis");
+const DEVIATION_COLOURS = colourTable("magma");
 
 const level = (value, high) => Math.max(0, Math.min(LEVELS - 1, Math.round((value / high) * (LEVELS - 1))));
 

@@ -18,7 +18,7 @@ class MapPane {
     if (this.header === null) return;
     const { counts } = this.header;
     this.paintContact(byId("map-contact"));
-    paintBar(byId("map-bar"), VIRIDIS);
+    paintBar(byId("map-bar"), PATTERN_COLOURS);
     const fates = { doubted: "not believed", light: "too light", outside: "outside the map", without_pose: "without a pose", together: "of two pads at one place" };
     const left = Object.entries(fates).filter(([key]) => counts[key] > 0).map(([key, why]) => `${counts[key]} ${why}`);
     const mark = page.hello?.source === "emulated" ? "EMULATED: " : "";
@@ -36,7 +36,7 @@ class MapPane {
     this.contact.values.forEach((value, pixel) => {
       if (Number.isNaN(value)) return; // nothing came there: transparent
       const at = 3 * level(value, 1);
-      image.data.set(value < 0 ? [200, 40, 30, 255] : [VIRIDIS[at], VIRIDIS[at + 1], VIRIDIS[at + 2], 255], 4 * pixel);
+      image.data.set(value < 0 ? [200, 40, 30, 255] : [PATTERN_COLOURS[at], PATTERN_COLOURS[at + 1], PATTERN_COLOURS[at + 2], 255], 4 * pixel);
     });
     context.putImageData(image, 0, 0);
   }
