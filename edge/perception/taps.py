@@ -175,16 +175,11 @@ class Taps:
                 continue
             # The error of a taxel is the same in all taps at one place, and the model takes it for seen several times:
             # on real grips such taps made five times as many holes as one alone (docs/decisions.md).
-            if any(self._distance_mm(earlier, other) < 0.5 for other in poses):
+            if any(earlier.away_mm(other, self._radius_mm) < 0.5 for other in poses):
                 continue
             slots.append(slot)
             poses.append(earlier)
         return slots, pose_rows(poses)
-
-    def _distance_mm(self, pose: PadPose, other: PadPose) -> float:
-        """Return the distance between two pads, root mean square over their taxels, in [mm], for small turns."""
-        turned_mm = self._radius_mm * radians(abs((pose.turn_deg - other.turn_deg + 180) % 360 - 180))
-        return hypot(pose.x_mm - other.x_mm, pose.y_mm - other.y_mm, turned_mm)
 
     def _leave_out(self, tap: int, kind: EventKind, why: str) -> None:
         if tap not in self._reported:
