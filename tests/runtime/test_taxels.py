@@ -334,11 +334,9 @@ def test_covariances_that_are_none_are_refused(covariances):
         TaxelEstimator(covariances, GRID)
 
 
-def test_no_file_and_no_living_taxel_are_refused(tmp_path):
+def test_a_file_that_is_missing_is_refused(tmp_path):
     with pytest.raises(EdgeError, match=r"taxels\.npz cannot be read"):
         load_estimator(tmp_path / "taxels.npz", GRID)
-    with pytest.raises(EdgeError, match="16 dead taxels"):
-        estimator().filler(dead(*range(16)))
 
 
 def test_deviations_are_wider_the_more_taxels_are_dead():
