@@ -17,7 +17,7 @@ from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
-from typing import ClassVar, Final, NamedTuple, Self
+from typing import ClassVar, Final, Self
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -46,30 +46,23 @@ SCRIPTS: Final = (
 """Files of the script in the order in which they are joined, so that they share one scope."""
 
 
-class Page(NamedTuple):
-    """Headers and body of an answer."""
-
-    headers: tuple[tuple[str, str], ...]
-    body: bytes
-
-
-def load_page() -> Page:
+def load_page() -> Response:
     """Return the page, with its style and its script inside: nothing else is fetched."""
     style = (FOLDER / "page.css").read_bytes()
     script = b"\n".join((FOLDER / name).read_bytes() for name in SCRIPTS)
     body = (FOLDER / "page.html").read_bytes()
     body = body.replace(b'<link rel="stylesheet" href="page.css">', b"<style>\n%s</style>" % style)
     body = body.replace(b' src="page.js"></script>', b">%s</script>" % script)
-    headers = (
-        ("Content-Type", "text/html; charset=utf-8"),
-        ("Content-Length", str(len(body))),
-        ("Content-Security-Policy", _policy(script)),
-        ("Cache-Control", "no-store"),
-        ("X-Content-Type-Options", "nosniff"),
-        ("Referrer-Policy", "no-referrer"),  # the address may hold the token
-        ("X-Frame-Options", "DENY"),  # or a stranger's page could make a user press a button unseen
-    )
-    return Page(headers, body)
+    headers = {
+        "Content-Type": "text/html; charset=utf-8",
+        "Content-Length": str(len(body)),
+        "Content-Security-Policy": _policy(script),
+        "Cache-Control": "no-store",
+        "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer",  # the address may hold the token
+        "X-Frame-Options": "DENY",  # or a stranger's page could make a user press a button unseen
+    }
+    return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(headers), body)
 
 
 def _policy(script: bytes) -> str:
@@ -248,9 +241,7 @@ class LiveView:
         if refusal is not None:
             status, why = refusal
             return connection.respond(status, f"{why}\n")
-        if request.path.partition("?")[0] == SOCKET:
-            return None
-        return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(self._page.headers), self._page.body)
+        return None if request.path.partition("?")[0] == SOCKET else self._page
 
     async def _attend(self, first: bytes, connection: ServerConnection) -> None:
         if len(self._viewers) >= MOST_VIEWERS:
