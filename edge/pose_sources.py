@@ -1,7 +1,7 @@
 """Sources of poses beside stdin, by the names that a user writes: zenoh, and ROS 2 with no ROS installed.
 
-They steer nothing else, and put what they receive into the queue of poses. docs/poses.md draws how a stamped pose of a
-tool frame becomes the pose of a pad in the plane of an object.
+They steer nothing else, and put what they receive into the queue of poses: `edge/pipeline/pose_queue.py`, which parses
+JSON, that of stdin, too. docs/poses.md draws how a stamped pose of a tool frame becomes a pad's in an object's plane.
 """
 
 import os

@@ -56,6 +56,11 @@ class PadPose:
             hypot(self.error_deg, newest.error_deg),
         )
 
+    def away_mm(self, other: "PadPose", radius_mm: float) -> float:
+        """Return how far the pad's points, `radius_mm` from its centre, moved from another pose: root mean square."""
+        turned_mm = 2 * radius_mm * sin(radians(self.turn_deg - other.turn_deg) / 2)
+        return hypot(self.x_mm - other.x_mm, self.y_mm - other.y_mm, turned_mm)
+
 
 POSE_FIELDS: Final = tuple(field.name for field in fields(PadPose))
 

@@ -92,11 +92,11 @@ def _write(replay: ReplayLink, path: Path, sensor: str | None) -> Iterator[str]:
 
 
 def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
-    from edge.sinks.converted_files import recorded_rows, write_npz
+    from edge.sinks.converted_files import RecordedRows, write_npz
 
     recording = replay.recordings[0]
     origin, geometry = recording.origin or "replay", recording.tracks[0].geometry
-    write_npz(path, recorded_rows(recording.path, geometry, origin), recording.mountings, recording.poses)
+    write_npz(path, RecordedRows(recording.path, geometry, origin), recording.mountings, recording.poses)
 
 
 def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:

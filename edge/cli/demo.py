@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.metrics import boundary_distance_mm, psnr_db, rmse_percent
 from edge.inference.bundled import demo_recording
-from edge.inference.contract import Model, scheduled_rows
+from edge.inference.contract import Model
 from edge.mapping.object_map import ObjectMap
 from edge.mapping.sink import MapSink, MapState
 from edge.perception.event import Event
@@ -178,12 +178,9 @@ class DemoScore:
         contract = self._model.contract
         if result.window is None:
             raise ValueError("result has no window, expected one with a pattern")
-        window = contract.scale_window(result.window)
-        if contract.takes_poses:
-            return self._model.run(window[:1], poses=scheduled_rows(1, contract.angle_step_deg))
-        padded = np.zeros((contract.taps, *window.shape[1:]), dtype=np.float32)
-        padded[0] = window[0]
-        return self._model.run(padded)
+        window = np.zeros((contract.taps, *result.window.shape[1:]), dtype=np.float32)
+        window[0] = contract.scale_window(result.window)[0]
+        return self._model.run(window)
 
     def text(self, coloured: bool) -> str:
         """Return the table of the scores, and the last tap's maps."""

@@ -257,7 +257,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         kept, replaced = False, options.out is not None and options.out.exists()
         if options.out is not None and failed is None and whole:
             free = {name: baseline for name, baseline in examined.baselines.items() if name not in examined.loaded}
-            port = watched.facts.port
+            port = watched.port
             try:
                 keep(options.out, sensor_file, port, free, visit.mountings, visit.weighed, emulated=emulated)
                 kept = True

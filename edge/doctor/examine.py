@@ -13,37 +13,20 @@ from numpy.typing import NDArray
 from edge.doctor import link_checks
 from edge.doctor import taxel_checks as taxels
 from edge.doctor.findings import Finding, judged
-from edge.doctor.link_checks import LineFacts
+from edge.doctor.link_checks import Watched
 from edge.doctor.taxel_checks import Samples
 from edge.errors import UsageError
 from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines, with_recorded
 from edge.validation import check_baselines, check_positive
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.links.base import LinkReader
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
+from firmware_bridge.links.serial_ports import latency_timer_ms
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.zeroing import baseline as zeroing
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, BaselineEstimator, deformation
-
-
-@dataclass
-class Watched:
-    """Data of a watch while the pads were free."""
-
-    scans: dict[str, list[Scan]] = field(default_factory=dict)  # of each sensor, in their order
-    counters: Mapping[str, int] = field(default_factory=dict)  # of the link
-    duration_s: float = 0.0  # length of the watch so far, in [s]
-    facts: LineFacts = field(default_factory=LineFacts)  # of the line
-    ids: frozenset[int] = frozenset()  # the CAN ids that came; empty where the link sees none
-    model: ModelMap = USPA44_MAP  # the id map that the user chose
-    rate_hz: float | None = None  # that a user expects of each sensor, in [Hz]
-    references: Mapping[str, Baseline] = field(default_factory=dict)  # earlier baselines of the free pads, by sensor
-    until_ns: int | None = None  # end of the watch, on the clock of the scans in [ns]; None stands for the newest scan
-    mountings: Mapping[str, Mounting] = field(default_factory=dict)  # of the sensors, as far as they are available
-
 
 _PRESSED: Final = (
     "something presses: free the pad, and repeat; this baseline is not stored. If it is free, the earlier baseline is "
@@ -71,12 +54,10 @@ def judge(watched: Watched, unix_time_s: float) -> Examined:
     fewest = 50  # scans that are judged: of fewer neither noise nor rate is known well enough
     enough = {name: samples for name, samples in sampled.items() if samples.scans >= fewest}
     half_silent = {name for name, samples in enough.items() if samples.living.mean() <= 0.5}
-    facts, counters, duration_s = watched.facts, watched.counters, watched.duration_s
-    taxel_count = watched.model.geometry.taxel_count
-    baud = link_checks.check_baud(facts, counters, duration_s, len(enough), watched.rate_hz, taxel_count)
-    id_map = link_checks.check_id_map(watched.ids, watched.model, bool(half_silent))
+    baud = link_checks.check_baud(watched, len(enough))
+    id_map = link_checks.check_id_map(watched, bool(half_silent))
     line_full = baud is not None and baud.verdict == "wrong"
-    of_link = [link_checks.check_link(counters, duration_s), baud, link_checks.check_latency(facts), id_map]
+    of_link = [link_checks.check_link(watched), baud, link_checks.check_latency(watched), id_map]
     findings = [finding for finding in of_link if finding is not None]
     if not enough:
         link_faulty = any(finding.verdict == "wrong" for finding in findings)
@@ -208,7 +189,10 @@ def watch(
             watched.duration_s = now_s - start_s
             tell(scans, watched.duration_s)
     finally:
-        watched.counters, watched.facts, watched.ids = link.counters(), link_checks.line_facts(link), link.can_ids()
+        watched.counters, watched.ids = link.counters(), link.can_ids()
+        if (line := link.serial_line()) is not None:
+            watched.port, watched.baud = line
+            watched.latency_ms = latency_timer_ms(watched.port)
         watched.until_ns = None if link.kind == "replay" else time.monotonic_ns()
 
 

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -11,18 +11,38 @@ import numpy as np
 
 from edge.doctor.findings import Finding, graded, judged
 from edge.doctor.taxel_checks import Samples
-from firmware_bridge.links.base import Link
-from firmware_bridge.links.serial_ports import LATENCY_ROOT, latency_timer_ms
-from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap
+from firmware_bridge.links.serial_ports import LATENCY_ROOT
+from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import LATEST_SCAN_S
+from firmware_bridge.zeroing.baseline import Baseline
 
 
-def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> Finding | None:
+@dataclass
+class Watched:
+    """Data of a watch while the pads were free."""
+
+    scans: dict[str, list[Scan]] = field(default_factory=dict)  # of each sensor, in their order
+    counters: Mapping[str, int] = field(default_factory=dict)  # of the link
+    duration_s: float = 0.0  # length of the watch so far, in [s]
+    port: str | None = None  # of a serial adapter; None for other links
+    baud: int | None = None  # speed at which its line was opened, in bit/s
+    latency_ms: int | None = None  # time for which the adapter's driver holds bytes back; None where it is not shown
+    ids: frozenset[int] = frozenset()  # the CAN ids that came; empty where the link sees none
+    model: ModelMap = USPA44_MAP  # the id map that the user chose
+    rate_hz: float | None = None  # that a user expects of each sensor, in [Hz]
+    references: Mapping[str, Baseline] = field(default_factory=dict)  # earlier baselines of the free pads, by sensor
+    until_ns: int | None = None  # end of the watch, on the clock of the scans in [ns]; None stands for the newest scan
+    mountings: Mapping[str, Mounting] = field(default_factory=dict)  # of the sensors, as far as they are available
+
+
+def check_id_map(watched: Watched, half_silent: bool) -> Finding | None:
     """Check that the chosen id map fits the CAN ids that came; None where none are seen at all.
 
     `half_silent` is true where half of the taxels or more of some sensor are silent.
     """
+    ids, model = watched.ids, watched.model
     if not ids:
         return None
     norm = "every taxel of a sensor by its id"
@@ -57,28 +77,14 @@ FULL_SHARE: Final = 0.9
 _BAD_LIMITS: Final = (1e-4, 1e-2)
 
 
-@dataclass(frozen=True, slots=True)
-class LineFacts:
-    """Facts on the way to a sensor."""
-
-    port: str | None = None  # of a serial adapter; None for other links
-    baud: int | None = None  # speed at which its line was opened, in bit/s
-    latency_ms: int | None = None  # time for which the adapter's driver holds bytes back; None where it is not shown
-
-
-def line_facts(link: Link) -> LineFacts:
-    """Return the facts of an open link."""
-    line = link.serial_line()
-    return LineFacts() if line is None else LineFacts(*line, latency_timer_ms(line[0]))
-
-
-def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None:
+def check_link(watched: Watched) -> Finding | None:
     """Check the link by its counters; None where they count neither bytes nor frames."""
+    counters = watched.counters
     received, frames = counters.get("received_bytes"), counters.get("frames")
     refusals = counters.get("refusals", 0)
     if received is None or frames is None:
         return _trouble(counters)
-    measured = f"{received} bytes, {frames} frames in {duration_s:.0f} s"
+    measured = f"{received} bytes, {frames} frames in {watched.duration_s:.0f} s"
     refused = f", {refusals} refusals" if refusals else ""
     off = (
         "is the sensor powered? The VScom needs both USB plugs, power first; the bus runs at 1 Mbit/s; a controller "
@@ -104,45 +110,36 @@ def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None
     return _trouble(counters) or Finding("link", "ok", measured)
 
 
-def check_baud(
-    facts: LineFacts,
-    counters: Mapping[str, int],
-    duration_s: float,
-    sensors: int,
-    rate_hz: float | None,
-    taxel_count: int = USPA44.taxel_count,
-) -> Finding | None:
-    """Check that the serial line carries what the sensors send; None where there is no serial line.
-
-    It was watched for `duration_s`, with so many sensors on the bus, of which a user expects `rate_hz` each, or None.
-    """
+def check_baud(watched: Watched, sensors: int) -> Finding | None:
+    """Check that the serial line carries what so many sensors on the bus send; None where there is no serial line."""
+    counters, duration_s, baud = watched.counters, watched.duration_s, watched.baud
     frames, received = counters.get("frames", 0), counters.get("received_bytes", 0)
-    if facts.baud is None or not frames or not sensors or duration_s <= 0:
+    if baud is None or not frames or not sensors or duration_s <= 0:
         return None
     line_bytes = 26 if received / frames > 24 else 22  # of a taxel's slcan line with a time stamp, and without one
-    carries_hz = facts.baud / BITS_PER_BYTE / (line_bytes * taxel_count * sensors)
-    used = received * BITS_PER_BYTE / duration_s / facts.baud
+    carries_hz = baud / BITS_PER_BYTE / (line_bytes * watched.model.geometry.taxel_count * sensors)
+    used = received * BITS_PER_BYTE / duration_s / baud
     pads = f"{sensors} sensors" if sensors > 1 else "a sensor"
-    measured = f"{facts.baud} baud carry {carries_hz:.0f} scans a second of {pads}, {100 * used:.0f} % are used"
+    measured = f"{baud} baud carry {carries_hz:.0f} scans a second of {pads}, {100 * used:.0f} % are used"
     norm = f"under {100 * FULL_SHARE:.0f} % used"
     remedy = "open a faster line: --source slcan:PORT@3000000, and set the adapter to the same (slcand -S 3000000)"
     if used > 1.05:
         return Finding("baud rate", "ok", f"{measured}: this adapter goes by USB and ignores it", norm)
     if used > FULL_SHARE:
         return Finding("baud rate", "wrong", measured, norm, remedy)
-    slow = carries_hz < (100.0 if rate_hz is None else rate_hz) and "ttyACM" not in (facts.port or "")
+    slow = carries_hz < (watched.rate_hz or 100.0) and "ttyACM" not in (watched.port or "")
     return judged("baud rate", "look" if slow else "ok", measured, norm, remedy)
 
 
-def check_latency(facts: LineFacts) -> Finding | None:
+def check_latency(watched: Watched) -> Finding | None:
     """Check that the adapter's driver passes bytes on as they come; None where it does not show its timer."""
-    if facts.latency_ms is None:
+    if watched.latency_ms is None:
         return None
-    port = Path(facts.port or "").resolve().name
+    port = Path(watched.port or "").resolve().name
     shown = f"{LATENCY_ROOT}/{port if port.startswith('ttyUSB') else 'ttyUSBn'}/latency_timer"
     remedy = f"echo 1 | sudo tee {shown}, and a udev rule that does so at each plug-in"
-    verdict = "wrong" if facts.latency_ms > 2 else "ok"
-    return judged("latency timer", verdict, f"{facts.latency_ms} ms", "up to 2 ms", remedy)
+    verdict = "wrong" if watched.latency_ms > 2 else "ok"
+    return judged("latency timer", verdict, f"{watched.latency_ms} ms", "up to 2 ms", remedy)
 
 
 def _trouble(counters: Mapping[str, int]) -> Finding | None:

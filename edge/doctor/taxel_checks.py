@@ -10,19 +10,18 @@ from edge.doctor.findings import Finding, graded, judged, worst
 from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.result import NOISE_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
+from edge.pipeline.cadence import Cadence
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
-
-AROUND: Final = 16  # scans before and after a scan that show whether it alone was late
 
 
 class Samples:
     """Scans of one sensor, without the first, which may have been cut in mid-cycle."""
 
     def __init__(self, scans: Sequence[Scan]) -> None:
-        kept = scans[1:]
+        self._kept = kept = scans[1:]
         self.scans = len(kept)
         # (n, 3, taxels) raw counts, and (n, taxels): whether the taxel sent a reading, and whether that is new.
         self.counts: NDArray[np.int32] = np.array([scan.counts.reshape(3, -1) for scan in kept], dtype=np.int32)
@@ -34,20 +33,15 @@ class Samples:
     def period_s(self) -> float:
         """Return the period from scan to scan, in [s]."""
         together = min(100, self.scans // 2)  # an adapter that delivers scans in bunches makes one meaningless
-        return float(np.median(self.time_s[together:] - self.time_s[:-together])) / together
+        period_s = float(np.median(self.time_s[together:] - self.time_s[:-together])) / together
+        return max(period_s, 1e-4)  # where a machine that stood still took most scans at once
 
     def lost(self) -> int:
-        """Count the scans that never came, by steps in time; a scan that is only late is followed by less late ones."""
-        period_s = self.period_s()
-        behind = self.time_s / period_s - np.arange(self.scans)
-        lost, last_gap = 0, 0
-        gaps_s = np.diff(self.time_s)[:-AROUND]  # nothing can be concluded from a gap at the very end
-        for gap in np.flatnonzero(gaps_s > 1.5 * period_s) + 1:
-            before = behind[max(last_gap, gap - AROUND) : gap].min()
-            step = round(float(behind[gap : gap + AROUND].min() - before))
-            lost += max(step, 0)
-            last_gap = gap
-        return lost
+        """Count the scans that never came, as a run does."""
+        cadence = Cadence()
+        for scan in self._kept:
+            cadence.follow(scan)
+        return cadence.missed
 
     def torn(self) -> NDArray[np.bool_]:
         """Return (n,), True for scans in which a living taxel was silent."""

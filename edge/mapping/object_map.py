@@ -6,8 +6,9 @@ the same part of the object lies under the same taxels. Heights are those of a p
 with what lies on the map already where both touched.
 """
 
+from collections import deque
 from dataclasses import dataclass
-from math import cos, hypot, radians, sin
+from math import cos, inf, radians, sin
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -100,21 +101,14 @@ def _reached(grid: Grid, centre_mm: float, reach_mm: float) -> tuple[int, NDArra
     return first, ((np.arange(first, last + 1) - at) / grid.px_per_mm).astype(np.float32)
 
 
-class Evidence(NamedTuple):
-    """Evidence of one pattern, in the pad's axes, and the height of its top above what it does not touch, in [mm].
-
-    Layers are (H, W, 4): weight of what was covered, log odds of a touch, information about the height in [1/mm^2], and
-    that information times the pattern.
-    """
-
-    layers: NDArray[np.float32]
-    top_mm: float
-
-
 def weigh(
     pattern: NDArray[np.float32], deviation: NDArray[np.float32] | None, pose: PadPose, pixel_mm: float, level: float
-) -> Evidence | None:
-    """Return the evidence of a pattern, None if it is flat: touched is where its share of the top exceeds `level`."""
+) -> tuple[NDArray[np.float32], float] | None:
+    """Return the evidence of a pattern, and the height of its top above what it does not touch, in [mm].
+
+    None if it is flat; touched is where its share of the top exceeds `level`. Evidence is (H, W, 4): weight of what was
+    covered, log odds of a touch, information about the height in [1/mm^2], and that information times the pattern.
+    """
     height, width = pattern.shape
     top_mm = float(np.partition(pattern, -8, axis=None)[-8:].mean())
     if not top_mm >= 0.05:  # [mm]; it may be all drift: a free pad that has warmed by a few kelvin makes 0.02 mm
@@ -132,7 +126,7 @@ def weigh(
     layers[..., 1] = odds
     np.divide(odds > 0, variance, out=layers[..., 2])
     np.multiply(layers[..., 2], pattern, out=layers[..., 3])
-    return Evidence(layers, top_mm)
+    return layers, top_mm
 
 
 def _moved(pattern: NDArray[np.float32], pose: PadPose, pixel_mm: float) -> NDArray[np.float32]:
@@ -150,9 +144,7 @@ def _moved(pattern: NDArray[np.float32], pose: PadPose, pixel_mm: float) -> NDAr
 
 
 STEP_MM: Final = 0.5  # movement within which patterns are one piece of evidence, about one pixel of a pattern
-PLACES: Final = 256  # places that are remembered as counted: 128 mm of a slide
-_RADIUS_MM: Final = USPA44.rows * USPA44.pitch_mm / 6**0.5
-"""Distance from the pad's centre at which a turn moves its points, at the root of their mean square."""
+_RADIUS_MM: Final = USPA44.rows * USPA44.pitch_mm / 6**0.5  # of the pad's points from its centre, root mean square
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +199,7 @@ class ObjectMap:
         # Coverage, log odds of a touch, information about the height, and that times the height, as in the evidence.
         self._sums = np.zeros((count * count, 4), dtype=np.float32)
         self._doubts = np.zeros(count * count, dtype=np.float32)
-        self._places = np.full((PLACES, 3), 1e9)  # [mm]: far away
+        self._places: deque[PadPose] = deque(maxlen=256)  # that are counted and remembered: 128 mm of a slide
         self._checks = False
         self._presses: dict[str, _Press] = {}
 
@@ -235,7 +227,7 @@ class ObjectMap:
             raise UsageError(f"the model's patterns are in {result.pattern_unit}, expected mm: choose another model")
         self._checks = self._checks or result.trusted is not None
         before, press = self._presses.get(sensor), _Press(pose, pose, result)
-        if before is not None and _distance_mm(before.origin, pose) < STEP_MM:
+        if before is not None and before.origin.away_mm(pose, _RADIUS_MM) < STEP_MM:
             if press.rank > before.rank:
                 before.pose, before.result = pose, result
             return
@@ -282,8 +274,7 @@ class ObjectMap:
             return
         fate = self._fuse(press, self._sums, self._doubts)
         if fate == "fused":
-            pose = press.pose
-            self._places[self.fused % PLACES] = pose.x_mm, pose.y_mm, radians(pose.turn_deg)
+            self._places.append(press.pose)
         self.counts[fate] += 1
 
     def _fuse(self, press: _Press, sums: NDArray[np.float32], doubts: NDArray[np.float32]) -> str:
@@ -298,11 +289,12 @@ class ObjectMap:
         if result.trusted is False:
             doubts[under.pixels] += self._worth(pose)
             return "doubted"
-        evidence = weigh(pattern, result.deviation, pose, pixel_mm, self._level)
-        if evidence is None or (result.trusted is None and (self._checks or _too_light(result))):
+        weighed = weigh(pattern, result.deviation, pose, pixel_mm, self._level)
+        if weighed is None or (result.trusted is None and (self._checks or _too_light(result))):
             return "light"
-        seen, before = under.read(evidence.layers), sums[under.pixels]
-        offset_mm = self._offset_mm(seen, before, evidence.top_mm)
+        evidence, top_mm = weighed
+        seen, before = under.read(evidence), sums[under.pixels]
+        offset_mm = self._offset_mm(seen, before, top_mm)
         seen[:, 3] += np.float32(offset_mm) * seen[:, 2]
         seen *= np.float32(self._worth(pose))
         seen += before
@@ -325,10 +317,8 @@ class ObjectMap:
 
         It is never worth nothing, since its noise and the error of its pose are new.
         """
-        x_mm, y_mm, turn_rad = self._places.T
-        turned_mm = _RADIUS_MM * 2 * np.sin((turn_rad - radians(pose.turn_deg)) / 2)
-        away_mm = np.sqrt((x_mm - pose.x_mm) ** 2 + (y_mm - pose.y_mm) ** 2 + turned_mm**2)
-        return min(1.0, max(0.05, float(away_mm.min()) / USPA44.pitch_mm))
+        away_mm = min((place.away_mm(pose, _RADIUS_MM) for place in self._places), default=inf)
+        return min(1.0, max(0.05, away_mm / USPA44.pitch_mm))
 
 
 def _too_light(result: Result) -> bool:
@@ -339,9 +329,3 @@ def _too_light(result: Result) -> bool:
 def _contact(covered: NDArray[np.float32], odds: NDArray[np.float32]) -> NDArray[np.float32]:
     nothing = np.full(len(odds), np.nan, dtype=np.float32)
     return np.divide(1, 1 + np.exp(-odds), out=nothing, where=covered > 0)
-
-
-def _distance_mm(pose: PadPose, other: PadPose) -> float:
-    """Return how far the points of a pad move between two poses, at the root of their mean square."""
-    turned_mm = _RADIUS_MM * 2 * sin(radians(pose.turn_deg - other.turn_deg) / 2)
-    return hypot(pose.x_mm - other.x_mm, pose.y_mm - other.y_mm, turned_mm)

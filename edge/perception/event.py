@@ -5,7 +5,7 @@ An event happens once; a note holds for as long as results carry it.
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple, Protocol, get_args
+from typing import Final, Literal, Protocol, get_args
 
 from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import Notice, NoticeKind
@@ -92,18 +92,6 @@ class Event:
     def of(cls, notice: Notice) -> "Event":
         """Return the event of a link's notice."""
         return cls(notice.time_ns, notice.kind, None, notice.text, notice.sensors)
-
-
-class Untimed(NamedTuple):
-    """An event whose time will be that of the next scan; fields as in `Event`."""
-
-    kind: EventKind
-    sensor: str | None = None
-    detail: str = ""
-
-    def at(self, time_ns: int) -> Event:
-        """Return the event at a time in [ns]."""
-        return Event(time_ns, *self)
 
 
 class Report(Protocol):

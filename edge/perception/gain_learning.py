@@ -22,7 +22,7 @@ from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
 from edge.perception.event import Report
 from edge.perception.result import Estimate, Step
-from edge.perception.trust_check import SensorPad
+from edge.perception.trust_check import PatternCheck, SensorPad
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.npz_recording import read_npz
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES, UNMEASURED_CERTAINTY, Pad
@@ -327,10 +327,12 @@ class Learn:
         waiting: a contact is there to be learned from, once the pad is free.
     """
 
-    def __init__(self, model: ContactModel, measured: Pad | None, pad: SensorPad, report: Report) -> None:
+    def __init__(
+        self, model: ContactModel, measured: Pad | None, pad: SensorPad, check: PatternCheck | None, report: Report
+    ) -> None:
         """Begin with the pad as measured, and the one in use, also by what was learned before."""
         self.waiting = False
-        self._pad, self._check, self._report = pad, pad.check, report
+        self._pad, self._check, self._report = pad, check, report
         self._learner = GainLearner(model, measured)
         self._from_file = measured is not None and measured.gains is not None
         self._used = pad.pad or measured or Pad()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
 from edge.inference.intervals import expect
-from edge.inference.trust_model import GRID, KPA, ForwardModel, Trust, pooling
+from edge.inference.trust_model import GRID, KPA, pooling
 from edge.perception.result import Estimate, Wrench
 from edge.perception.trust_check import SensorPad
 from firmware_bridge.pad_geometry import SensorGeometry
@@ -61,11 +61,10 @@ class Balance:
     count of shear, by all contacts of the sensor.
     """
 
-    def __init__(self, forward: ForwardModel, geometry: SensorGeometry) -> None:
-        self._forward = forward
+    def __init__(self, geometry: SensorGeometry) -> None:
         self._area_mm2 = geometry.rows * geometry.cols * geometry.pitch_mm**2
         self._tap: int | None = None
-        self._pad_row: NDArray[np.float32] | None = None
+        self._operator: NDArray[np.float32] | None = None
         self._pressing = np.zeros((2, 0))
         self._counts_per_n: tuple[float, float] = (0.0, 0.0)
         self._shear = (0.0, 0.0)
@@ -77,14 +76,15 @@ class Balance:
         pattern: NDArray[np.float32],
         readings: NDArray[np.float32],
         tap: int,
-        pad_row: NDArray[np.float32],
+        operator: NDArray[np.float32],
     ) -> NDArray[np.float32]:
         """Return the network's traction (3, h, w) with the force of the readings (3, rows, cols) that it was made from.
 
-        The pattern (H, W) is in [mm], readings in network units, the pad as model input; `tap` numbers the contact.
+        The pattern (H, W) is in [mm], readings in network units; `tap` numbers the contact, and the operator is the
+        pad's.
         """
-        if pad_row is not self._pad_row:
-            self._use_pad(pad_row, pattern.shape)
+        if operator is not self._operator:
+            self._use_pad(operator, pattern.shape)
         flat = traction_kpa.reshape(3, -1)
         n_per_kpa = self._area_mm2 / flat.shape[1] * _N_OF_KPA_MM2
         x_n, y_n, z_n = (flat.sum(axis=1) * n_per_kpa).tolist()
@@ -116,9 +116,8 @@ class Balance:
         mixed = np.array([(1, 0, more_x), (0, 1, more_y), (0, 0, z * by_force / squares / z_n)], dtype=np.float32)
         return (mixed @ flat).reshape(traction_kpa.shape)
 
-    def _use_pad(self, pad_row: NDArray[np.float32], pattern_shape: tuple[int, ...]) -> None:
+    def _use_pad(self, operator: NDArray[np.float32], pattern_shape: tuple[int, ...]) -> None:
         """Sum a pad's operator over the taxels: readings of x and y that a pattern makes, and those of 1 N of drag."""
-        operator = self._forward.of_pad(pad_row[: len(self._forward.operator) - 1])
         summed = operator.reshape(3, -1, operator.shape[1])[:2].sum(axis=1)
         pattern, drag = summed[:, : GRID**2].reshape(2, GRID, GRID), summed[:, GRID**2 :].reshape(2, 2, -1)
         height, width = pattern_shape
@@ -126,7 +125,7 @@ class Balance:
         dragged_n = KPA * self._area_mm2 * _N_OF_KPA_MM2
         self._counts_per_n = (float(drag[0, 0].sum()) / dragged_n, float(drag[1, 1].sum()) / dragged_n)
         self._shear = _SHEAR_PRIOR_N2, _SHEAR_PRIOR_N2
-        self._pad_row = pad_row
+        self._operator = operator
 
 
 def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:
@@ -156,9 +155,9 @@ def touched_patch(
 class Describe:
     """Stage: everything that follows from a pattern: area, interval, expected error, wrench."""
 
-    def __init__(self, contract: Contract, trust: Trust | None, geometry: SensorGeometry, pad: SensorPad) -> None:
+    def __init__(self, contract: Contract, geometry: SensorGeometry, pad: SensorPad) -> None:
         self._contract, self._geometry, self._pad = contract, geometry, pad
-        self._balance = None if trust is None else Balance(trust.forward, geometry)
+        self._balance = Balance(geometry)
         self._pixel_mm = geometry.pixel_pitch_mm(contract.scale)
 
     def __call__(
@@ -182,7 +181,7 @@ class Describe:
                 mean_mm = float(deviation.ravel() @ touching.ravel()) / np.count_nonzero(touching)
                 made.interval_mm = contract.interval_factor * mean_mm
         if (traction := made.traction) is not None:
-            if self._balance is not None:
-                made.traction = traction = self._balance(traction, pattern, newest, tap, self._pad.row)
+            if (operator := self._pad.operator) is not None:
+                made.traction = traction = self._balance(traction, pattern, newest, tap, operator)
             made.wrench = wrench_of(traction, self._geometry.rows * self._geometry.pitch_mm / traction.shape[1])
             made.wrench_origin = self._pad.wrench_origin

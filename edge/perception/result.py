@@ -183,14 +183,6 @@ def _bits(taxels: bytes) -> int:
     return int.from_bytes(np.packbits(np.frombuffer(taxels, dtype=np.bool_), bitorder="little").tobytes(), "little")
 
 
-class Origin(NamedTuple):
-    """Fields that all results of a run have in common."""
-
-    source: SourceKind
-    model: str
-    pattern_unit: str
-
-
 class Window(NamedTuple):
     """Taps that a pattern is due of."""
 
@@ -259,8 +251,8 @@ class Step:
     notes: tuple[Note, ...] = ()
     events: tuple[Event, ...] = ()
 
-    def __init__(self, scan: Scan, origin: Origin) -> None:
-        self.scan, self._origin = scan, origin
+    def __init__(self, scan: Scan, source: SourceKind, model: str, pattern_unit: str) -> None:
+        self.scan, self.source, self.model, self.pattern_unit = scan, source, model, pattern_unit
         self.state: State = "zeroing"
 
     def overtake(self) -> None:
@@ -277,7 +269,7 @@ class Step:
                 self.notes = (*self.notes, waited_note(waited_ns))
         # What no stage has set is not in the dictionary, and has its default in the result.
         values: dict[str, Any] = dict(vars(self))
-        for name in ("readings", "doubted", "due", "estimate", "_origin"):
+        for name in ("readings", "doubted", "due", "estimate"):
             values.pop(name, None)
         due, made = self.due, self.estimate
         if made is not None:
@@ -288,7 +280,7 @@ class Step:
             values |= {"taps_used": due.taps, "window": due.counts[: due.taps], "poses": due.poses}
         if self.doubted:
             values |= {"trusted": False, "untrusted_reason": "baseline"}
-        return Result(**values, **self._origin._asdict())
+        return Result(**values)
 
 
 NOISE_COUNTS: Final = 2.0  # standard deviation of a reading at rest: 1.7 to 2.6 in recordings

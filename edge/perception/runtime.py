@@ -5,21 +5,21 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import UsageError, WindowError
-from edge.inference.contract import Contract, Model
+from edge.inference.contract import Model
 from edge.inference.intervals import doubt
-from edge.inference.trust_model import Trust
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
-from edge.perception.event import OLD_NS, UNCHECKED, EventKind, Untimed, age_notes, notes_on_missing
+from edge.perception.event import OLD_NS, UNCHECKED, Event, EventKind, age_notes, notes_on_missing
 from edge.perception.gain_learning import ContactModel, Learn
 from edge.perception.pattern_description import Describe
-from edge.perception.result import Estimate, LastPattern, Origin, Result, Step, Window
+from edge.perception.result import Estimate, LastPattern, Result, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taps import Taps
 from edge.perception.taxel_health import Health, TaxelEstimator
@@ -38,25 +38,6 @@ from firmware_bridge.zeroing.baseline import Baseline
 MOST_TOGETHER: Final = 4  # sensors whose patterns are made in one call: scans that come meanwhile wait for its end
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Settings of a runtime from which its sensors are made; those of single sensors are by name, or one for all."""
-
-    contract: Contract
-    trust: Trust | None
-    geometry: SensorGeometry
-    options: RuntimeOptions
-    estimator: TaxelEstimator | None
-    contacts: ContactModel | None
-    unix_time_s: Callable[[], float]
-    baselines: Mapping[str, Baseline]
-    mountings: Mapping[str, Mounting]
-    counts_per_newton: float | Mapping[str, float] | None
-    pad: Pad | Mapping[str, Pad] | None
-    measured: Mapping[str, Pad] | None
-    scale_intervals: Mapping[str, tuple[float, float]]
-
-
 class Sensor:
     """Stages of one sensor, made complete once with what is stored for it.
 
@@ -67,39 +48,39 @@ class Sensor:
         tracker: of its taps.
     """
 
-    def __init__(self, name: str, time_ns: int, settings: Settings) -> None:
-        """Begin with the sensor's first scan, at a time in [ns]."""
-        contract, geometry, options = settings.contract, settings.geometry, settings.options
-        mounting, baseline = settings.mountings.get(name), settings.baselines.get(name)
+    def __init__(self, name: str, time_ns: int, runtime: "Runtime") -> None:
+        """Begin with the first scan of a runtime's sensor, at a time in [ns]."""
+        contract, geometry, options, trust = runtime.model.contract, runtime.geometry, runtime.options, runtime.trust
+        mounting, baseline = runtime.mountings.get(name), runtime.baselines.get(name)
         mounting = mounting if mounting is not None and mounting.turns_axes else None
-        pad = _of(name, settings.pad)
-        check = None if settings.trust is None else PatternCheck(settings.trust, contract, self.report)
-        self.events: list[Untimed] = []
+        pad = _of(name, runtime.pad)
+        self.events: list[Callable[[int], Event]] = []  # at the time of the next scan
         self.last: LastPattern | None = None
         self.pad = SensorPad(
-            contract, pad, _of(name, settings.counts_per_newton), check, _of(name, settings.scale_intervals)
+            contract, trust, pad, _of(name, runtime.counts_per_newton), runtime.scale_intervals.get(name)
         )
+        check = None if trust is None else PatternCheck(trust, contract, self.pad, self.report)
         self._name = name
         self._received_ns: int | None = None
         self._check, self._options = check, options
         self.tracker = TapTracker(contract.taps, options, (geometry.rows, geometry.cols))
-        self._health = Health((geometry.rows, geometry.cols), mounting, settings.estimator)
-        notes = notes_on_missing(name, settings.mountings, settings.baselines)
-        self._zeroing = Zeroing(self.tracker, self._health, mounting, self.report, settings.unix_time_s, notes)
+        self._health = Health((geometry.rows, geometry.cols), mounting, runtime.estimator)
+        notes = notes_on_missing(name, runtime.mountings, runtime.baselines)
+        self._zeroing = Zeroing(self.tracker, self._health, mounting, self.report, runtime.unix_time_s, notes)
         self._doubt = BaselineDoubt(options, geometry.taxel_count, self.report)
         self._taps = Taps(self.tracker, self._health, contract, options, self.report)
-        self._describe = Describe(contract, settings.trust, geometry, self.pad)
+        self._describe = Describe(contract, geometry, self.pad)
         self.learn: Learn | None = None
-        if settings.contacts is not None:
-            measured = pad if settings.measured is None else settings.measured.get(name)
-            self.learn = Learn(settings.contacts, measured, self.pad, self.report)
+        if runtime.contacts is not None and options.learn:
+            measured = pad if runtime.measured is None else runtime.measured.get(name)
+            self.learn = Learn(runtime.contacts, measured, self.pad, check, self.report)
         if baseline is not None:
-            age_s = baseline.age_s(settings.unix_time_s())
+            age_s = baseline.age_s(runtime.unix_time_s())
             # A baseline from the future means that one of the two clocks was wrong.
             self._zeroing.use(baseline, age_s if age_s >= 0 else None, time_ns)
             self._doubt.begin(baseline.origin)
 
-    def follow(self, step: Step, track: PoseTrack | None, events: list[Untimed]) -> None:
+    def follow(self, step: Step, track: PoseTrack | None, events: list[Callable[[int], Event]]) -> None:
         """Pass the step of the sensor's next scan through the stages before the model; a window is due then, or none.
 
         It takes the events of all sensors with those of its own; `track` has the poses of its pad, None without.
@@ -118,7 +99,7 @@ class Sensor:
         if scan.time_ns - scan.not_before_ns > OLD_NS:
             step.notes = (*step.notes, *age_notes(scan))
         if events or self.events:
-            step.events = tuple(event.at(scan.time_ns) for event in (*events, *self.events))
+            step.events = tuple(event(scan.time_ns) for event in (*events, *self.events))
             events.clear()
             self.events.clear()
         if step.zeroed is None:
@@ -195,17 +176,18 @@ class Sensor:
 
     def report(self, kind: EventKind, detail: str = "") -> None:
         """Report an event with the sensor's next scan."""
-        self.events.append(Untimed(kind, self._name, detail))
+        self.events.append(partial(Event, kind=kind, sensor=self._name, detail=detail))
 
 
 def _of(name: str, setting: Any) -> Any:
     return setting.get(name) if isinstance(setting, Mapping) else setting
 
 
+@dataclass(eq=False, repr=False)
 class Runtime:
     """Maker of one result per scan; `open_runtime` makes one, and describes the settings that are not listed here.
 
-    Args:
+    Attributes:
         estimator: of dead taxels, on the same grid; without it there is no pattern while a taxel is dead.
         contacts: distribution of contacts by which gains are learned, if the options ask for that; without it none are.
         mountings: directions of a sensor's axes, and its gains, by name; without one the axes are as wired.
@@ -213,8 +195,7 @@ class Runtime:
         scale_intervals: 90 % intervals of counts per newton, by name.
         unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;
             from then on ages follow scan time.
-
-    Attributes:
+        trust: checks that the model brings along; None without.
         unposed: name of the model if it takes no poses, reported to a user who states some; None if it takes them.
         waiting: the newest scan of each sensor that waits for its pattern. A newer scan keeps the place of the one it
             overtakes: the sensor that has waited longest is the first.
@@ -225,66 +206,49 @@ class Runtime:
             another grid; the options ask for more taps than the model takes.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        *,
-        source: SourceKind,
-        estimator: TaxelEstimator | None = None,
-        contacts: ContactModel | None = None,
-        geometry: SensorGeometry = USPA44,
-        baselines: Mapping[str, Baseline] | None = None,
-        counts_per_newton: float | Mapping[str, float] | None = None,
-        mountings: Mapping[str, Mounting] | None = None,
-        pad: Pad | Mapping[str, Pad] | None = None,
-        measured: Mapping[str, Pad] | None = None,
-        scale_intervals: Mapping[str, tuple[float, float]] | None = None,
-        options: RuntimeOptions = DEFAULTS,
-        clock_ns: Callable[[], int] = time.perf_counter_ns,
-        unix_time_s: Callable[[], float] = time.time,
-    ) -> None:
-        contract = model.contract
+    model: Model
+    _: KW_ONLY
+    source: SourceKind
+    estimator: TaxelEstimator | None = None
+    contacts: ContactModel | None = None
+    geometry: SensorGeometry = USPA44
+    baselines: Mapping[str, Baseline] = field(default_factory=dict)
+    counts_per_newton: float | Mapping[str, float] | None = None
+    mountings: Mapping[str, Mounting] = field(default_factory=dict)
+    pad: Pad | Mapping[str, Pad] | None = None
+    measured: Mapping[str, Pad] | None = None
+    scale_intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    options: RuntimeOptions = DEFAULTS
+    clock_ns: Callable[[], int] = time.perf_counter_ns
+    unix_time_s: Callable[[], float] = time.time
+
+    def __post_init__(self) -> None:
+        contract, options, geometry = self.model.contract, self.options, self.geometry
         contract.check_sensor(geometry)
-        check_baselines(baselines or {}, geometry)
-        check_counts_per_newton(counts_per_newton)
-        check_pads(pad, geometry)
-        check_pads(measured, geometry)
-        check_mountings(mountings or {}, geometry)
+        check_baselines(self.baselines, geometry)
+        check_counts_per_newton(self.counts_per_newton)
+        check_pads(self.pad, geometry)
+        check_pads(self.measured, geometry)
+        check_mountings(self.mountings, geometry)
         if options.taps is not None and options.taps > contract.taps:
-            raise UsageError(f"taps is {options.taps}, but model '{model.name}' takes {contract.taps} at most")
-        self.unposed = None if contract.takes_poses else model.name
+            raise UsageError(f"taps is {options.taps}, but model '{self.model.name}' takes {contract.taps} at most")
+        self.baselines, self.mountings = dict(self.baselines), dict(self.mountings)
+        self.trust = contract.read_trust()
+        self.unposed = None if contract.takes_poses else self.model.name
         self.waiting: dict[str, tuple[Sensor, Step, Window]] = {}
-        self._model, self._clock_ns = model, clock_ns
-        self._scan_shape = geometry.scan_shape
-        self._origin = Origin(source, model.name, contract.output_unit)
-        self._settings = Settings(
-            contract=contract,
-            trust=contract.read_trust(),
-            geometry=geometry,
-            options=options,
-            estimator=estimator,
-            contacts=contacts if options.learn else None,
-            unix_time_s=unix_time_s,
-            baselines=dict(baselines or {}),
-            mountings=dict(mountings or {}),
-            counts_per_newton=counts_per_newton,
-            pad=pad,
-            measured=measured,
-            scale_intervals=scale_intervals or {},
-        )
         self._sensors: dict[str, Sensor] = {}
-        self._events: list[Untimed] = []
+        self._events: list[Callable[[int], Event]] = []
         self._tracks: dict[str | None, PoseTrack] = {}
 
     def __repr__(self) -> str:
         sensors = ", ".join(self._sensors) or "none so far"
-        return f"<Runtime of {self._origin.model}, {self._origin.source}, sensors: {sensors}>"
+        return f"<Runtime of {self.model.name}, {self.source}, sensors: {sensors}>"
 
     @property
     def expected(self) -> frozenset[str]:
         """Names of the sensors with stored baselines or counts per newton."""
-        per_newton = self._settings.counts_per_newton
-        return frozenset({*self._settings.baselines, *(per_newton if isinstance(per_newton, Mapping) else ())})
+        per_newton = self.counts_per_newton
+        return frozenset({*self.baselines, *(per_newton if isinstance(per_newton, Mapping) else ())})
 
     def take_learned(self) -> dict[str, Pad]:
         """Return the pads with gains learned since the last call, by sensor name."""
@@ -295,7 +259,7 @@ class Runtime:
         """Forget the taps of every sensor, as for a new object, and report it as an event; zeroing stays."""
         for sensor in self._sensors.values():
             sensor.tracker.reset()
-        self._events.append(Untimed("reset"))
+        self._events.append(partial(Event, kind="reset", sensor=None))
 
     def zero(self, name: str | None = None, *, force: bool = False) -> None:
         """Zero a sensor or all from the next scans, also in contact if forced; an event reports the outcome.
@@ -308,7 +272,7 @@ class Runtime:
         if not chosen:
             sensors = ", ".join(sorted(self._sensors))
             why = f"no sensor {name}, there are {sensors}" if sensors else "no scan has arrived yet"
-            self._events.append(Untimed("refused", None, f"zeroing refused: {why}"))
+            self._events.append(partial(Event, kind="refused", sensor=None, detail=f"zeroing refused: {why}"))
 
     def pose(self, pose: PadPose, time_ns: int, sensor: str | None = None, *, holds: bool = False) -> bool:
         """Take a pose of a pad at a monotonic time in [ns]; False unless it is later than the one before.
@@ -344,12 +308,12 @@ class Runtime:
             WindowError: the scan is not of this sensor geometry.
         """
         name = scan.sensor
-        if scan.counts.shape != self._scan_shape:
-            raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
+        if scan.counts.shape != self.geometry.scan_shape:
+            raise WindowError(f"scan has shape {scan.counts.shape}, expected {self.geometry.scan_shape}")
         sensor = self._sensors.get(name)
         if sensor is None:
-            sensor = self._sensors[name] = Sensor(name, scan.time_ns, self._settings)
-        step = Step(scan, self._origin)
+            sensor = self._sensors[name] = Sensor(name, scan.time_ns, self)
+        step = Step(scan, self.source, self.model.name, self.model.contract.output_unit)
         # Without a pose of any pad, which is the rule, this is all that poses cost.
         track = (self._tracks.get(name) or self._tracks.get(None) or None) if self._tracks else None
         sensor.follow(step, track, self._events)
@@ -376,7 +340,7 @@ class Runtime:
         due = list(map(self.waiting.pop, list(self.waiting)[:MOST_TOGETHER] if only is None else [only]))
         if not due:
             return []
-        model, start_ns = self._model, self._clock_ns()
+        model, start_ns = self.model, self.clock_ns()
         begun: list[Estimate] = []
         inputs: list[NDArray[np.float32]] = []
         pads: list[NDArray[np.float32]] = []
@@ -389,7 +353,7 @@ class Runtime:
             if made.poses is not None:
                 poses.append(made.poses)
         patterns = model.run_together(inputs, pads, *([poses] if poses else []))
-        run_time_us = (self._clock_ns() - start_ns) / 1e3
+        run_time_us = (self.clock_ns() - start_ns) / 1e3
         for row, ((sensor, step, window), made) in enumerate(zip(due, begun, strict=True)):
             made.pattern, step.run_time_us = patterns[row], run_time_us
             made.deviation = None if model.deviation is None else model.deviation[row]

@@ -1,6 +1,7 @@
 """Stage that follows the taps of one sensor: the window of a due pattern, its poses, and where to touch next."""
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Sequence
 from math import cos, hypot, radians, sin, sqrt
 from typing import Final
 
@@ -16,79 +17,6 @@ from edge.perception.taxel_health import Health
 from edge.perception.trust_check import REPEATS
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack
-
-
-class TapPoses:
-    """Poses of one sensor's taps: each earlier tap has that of its peak, and each that is left out an event.
-
-    While the sensor has no poses, so many `scheduled` taps at most follow the paper's schedule.
-    """
-
-    def __init__(self, contract: Contract, scheduled: int, report: Callable[[EventKind, str], object]) -> None:
-        self._reach_mm, self._step_deg = contract.reach_mm, contract.angle_step_deg
-        # Root mean square of the taxels' distance from the middle of the pad.
-        self._radius_mm = contract.pitch_mm * sqrt((contract.rows**2 + contract.cols**2 - 2) / 12)
-        self._scheduled = scheduled
-        self._report = report
-        self._poses: dict[int, PadPose] = {}
-        self._reported: set[int] = set()
-
-    def follow(self, tap: TapTracker, track: PoseTrack) -> None:
-        """Look up the poses of earlier taps, and forget those that the tracker has forgotten.
-
-        A pose may come later than its scan, and a track is short, so that every scan looks for what is missing.
-        """
-        poses = self._poses
-        for peak in tap.peaks:
-            if peak.tap not in poses and (pose := track.at(peak.time_ns)) is not None:
-                poses[peak.tap] = pose
-        if max(len(poses), len(self._reported) - 1) > len(tap.peaks):
-            remembered = {peak.tap for peak in tap.peaks}
-            self._poses = {number: pose for number, pose in poses.items() if number in remembered}
-            self._reported &= remembered | {tap.tap}
-
-    def choose(
-        self, tap: TapTracker, pose: PadPose | None, *, scheduled: bool
-    ) -> tuple[Sequence[int], NDArray[np.float32]]:
-        """Return the taps to use during contact: places in the window, newest first, and their poses as model input.
-
-        The pose is that of the newest tap's pad at this scan.
-        """
-        if scheduled:
-            taps = min(tap.taps_used, self._scheduled)
-            return range(taps), scheduled_rows(taps, self._step_deg)
-        if pose is None:
-            self._leave_out(tap.tap, "tap_without_pose", "this tap has no pose: its pattern is made from it alone")
-            return (0,), scheduled_rows(1, 0.0)
-        slots, poses = [0], [pose]
-        for slot, peak in enumerate(tap.peaks, 1):
-            earlier = self._poses.get(peak.tap)
-            if earlier is None:
-                self._leave_out(peak.tap, "tap_without_pose", "an earlier tap has no pose, and is left out")
-                continue
-            away_mm = hypot(earlier.x_mm - pose.x_mm, earlier.y_mm - pose.y_mm)
-            if away_mm > self._reach_mm:
-                why = f"an earlier tap is {away_mm:.1f} mm away, and the model takes none beyond {self._reach_mm:g} mm"
-                self._leave_out(peak.tap, "tap_out_of_reach", f"{why}: it is left out")
-                continue
-            # The error of a taxel is the same in all taps at one place, and the model takes it for seen several times:
-            # on real grips such taps made five times as many holes as one alone (docs/decisions.md).
-            if any(self._distance_mm(earlier, other) < 0.5 for other in poses):
-                continue
-            slots.append(slot)
-            poses.append(earlier)
-        return slots, pose_rows(poses)
-
-    def _distance_mm(self, pose: PadPose, other: PadPose) -> float:
-        """Return the distance between two pads, root mean square over their taxels, in [mm], for small turns."""
-        turned_mm = self._radius_mm * radians(abs((pose.turn_deg - other.turn_deg + 180) % 360 - 180))
-        return hypot(pose.x_mm - other.x_mm, pose.y_mm - other.y_mm, turned_mm)
-
-    def _leave_out(self, tap: int, kind: EventKind, why: str) -> None:
-        if tap not in self._reported:
-            self._reported.add(tap)
-            self._report(kind, why)
-
 
 _HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
 """Four taps half a pitch apart read what lies between the taxels. A search for the place of the largest expected gain
@@ -178,11 +106,14 @@ class Taps:
         self, tracker: TapTracker, health: Health, contract: Contract, options: RuntimeOptions, report: Report
     ) -> None:
         self._tracker, self._health = tracker, health
+        self._contract, self._report = contract, report
         self._most = contract.taps if options.taps is None else options.taps
+        self._scheduled = options.taps or contract.unposed_taps
         self._on_counts = options.contact_on_counts
-        posed = contract.takes_poses
-        self._poses = TapPoses(contract, options.taps or contract.unposed_taps, report) if posed else None
-        self.advice = TapAdvice(contract.reach_mm, self._most) if posed else None
+        # Root mean square of the taxels' distance from the middle of the pad.
+        self._radius_mm = contract.pitch_mm * sqrt((contract.rows**2 + contract.cols**2 - 2) / 12)
+        self._reported: deque[int] = deque(maxlen=64)  # newest taps that were left out; no window has as many
+        self.advice = TapAdvice(contract.reach_mm, self._most) if contract.takes_poses else None
 
     def __call__(self, step: Step, track: PoseTrack | None) -> None:
         """Take a step with readings; `track` has the poses of its pad, None if there are none."""
@@ -191,8 +122,9 @@ class Taps:
             return
         tap = self._tracker
         tap.push(readings, scan.time_ns, z_counts, scan.on_bus_ns, doubted=step.doubted)
-        if self._poses is not None and track is not None:
-            self._poses.follow(tap, track)
+        if track is not None:  # a pose may come later than its scan, and a track is short
+            for peak in tap.peaks:
+                peak.pose = peak.pose or track.at(peak.time_ns)
         step.state, step.contact = "idle", tap.contact
         if tap.contact:
             step.state, step.due = "contact", self._window(step, tap, scheduled=track is None)
@@ -201,20 +133,55 @@ class Taps:
             if z_counts >= self._on_counts:  # to be looked at, and made from this scan alone
                 counts = np.zeros_like(tap.window)
                 counts[0] = readings
-                rows = None if self._poses is None else scheduled_rows(1, 0.0)
+                rows = scheduled_rows(1, 0.0) if self._contract.takes_poses else None
                 step.due = Window(counts, 1, (0,), rows, NO_TAP, (NO_TAP, step.filled))
         if self.advice is not None and not step.doubted:
             step.next_tap = self.advice.proposal(tap)
 
     def _window(self, step: Step, tap: TapTracker, *, scheduled: bool) -> Window:
         taps = min(tap.taps_used, self._most)
-        if self._poses is None:
-            # A copy, since the tracker overwrites its own if the sensor's next scan comes in the same call.
-            counts, slots, rows = tap.window.copy(), range(len(tap.window)), None
+        if not self._contract.takes_poses:
+            counts, slots, rows = tap.window, range(taps), None
         else:
-            slots, rows = self._poses.choose(tap, step.pose, scheduled=scheduled)
+            slots, rows = self._choose(tap, step.pose, scheduled=scheduled)
             taps = min(taps, len(slots))
             slots, rows = slots[:taps], rows[:taps]
             counts = tap.window[list(slots)]
         made_by = (tap.tap, tuple(slots), taps, step.filled, self._health.most_repeats >= REPEATS)
         return Window(counts, taps, slots, rows, tap.tap, made_by)
+
+    def _choose(
+        self, tap: TapTracker, pose: PadPose | None, *, scheduled: bool
+    ) -> tuple[Sequence[int], NDArray[np.float32]]:
+        """Return the taps to use during contact: places in the window, newest first, and their poses as model input.
+
+        The pose is that of the newest tap's pad at this scan; without poses taps follow the paper's schedule.
+        """
+        if scheduled:
+            taps = min(tap.taps_used, self._scheduled)
+            return range(taps), scheduled_rows(taps, self._contract.angle_step_deg)
+        if pose is None:
+            self._leave_out(tap.tap, "tap_without_pose", "this tap has no pose: its pattern is made from it alone")
+            return (0,), scheduled_rows(1, 0.0)
+        slots, poses, reach_mm = [0], [pose], self._contract.reach_mm
+        for slot, peak in enumerate(tap.peaks, 1):
+            if (earlier := peak.pose) is None:
+                self._leave_out(peak.tap, "tap_without_pose", "an earlier tap has no pose, and is left out")
+                continue
+            away_mm = hypot(earlier.x_mm - pose.x_mm, earlier.y_mm - pose.y_mm)
+            if away_mm > reach_mm:
+                why = f"an earlier tap is {away_mm:.1f} mm away, and the model takes none beyond {reach_mm:g} mm"
+                self._leave_out(peak.tap, "tap_out_of_reach", f"{why}: it is left out")
+                continue
+            # The error of a taxel is the same in all taps at one place, and the model takes it for seen several times:
+            # on real grips such taps made five times as many holes as one alone (docs/decisions.md).
+            if any(earlier.away_mm(other, self._radius_mm) < 0.5 for other in poses):
+                continue
+            slots.append(slot)
+            poses.append(earlier)
+        return slots, pose_rows(poses)
+
+    def _leave_out(self, tap: int, kind: EventKind, why: str) -> None:
+        if tap not in self._reported:
+            self._reported.append(tap)
+            self._report(kind, why)

@@ -5,6 +5,7 @@ scale: the edge of a figure, a face over the whole pad. The living taxels give t
 kind an estimate.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -94,7 +95,7 @@ class Health:
     ) -> None:
         """Start with no reading of a grid (rows, cols); without a mounting its axes are as wired."""
         self._mounting, self._estimator = mounting, estimator
-        self._filler: Filler | None = None
+        self._fill: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None
         self.held: NDArray[np.int32] = np.zeros((3, *grid_shape), dtype=np.int32)
         self.dead, self._arrived, self._saturated, self._unzeroed = np.zeros((4, *grid_shape), dtype=bool)
         # Scans since a taxel arrived, in which it repeated itself, was far, was well, and gave no new count.
@@ -149,9 +150,8 @@ class Health:
         step.dead = self.reasons
         if self.dead is dead:
             return False
-        count = np.count_nonzero(self.dead)
-        possible = self._estimator is not None and 0 < 2 * count <= dead.size
-        self._filler = self._estimator.filler(self.dead) if self._estimator is not None and possible else None
+        possible = 0 < 2 * np.count_nonzero(self.dead) <= dead.size
+        self._fill = self._estimator.filler(self.dead) if self._estimator is not None and possible else None
         return True
 
     def fill(self, step: Step) -> None:
@@ -160,8 +160,8 @@ class Health:
         if not self.sound:
             silent = sum(reason == "silent" for reason in self.reasons.values())
             # Half of them silent are not a defect but a wrong id map.
-            if readings is not None and self._filler is not None and 2 * silent < self.dead.size:
-                readings, step.filled = self._filler(readings), "neighbours"
+            if readings is not None and self._fill is not None and 2 * silent < self.dead.size:
+                readings, step.filled = self._fill(readings), "neighbours"
             step.notes = (*step.notes, *self._notes(step.filled))
             if not (self._arrived | self.dead).all() or (step.dead and step.filled is None):
                 return
@@ -299,34 +299,26 @@ class TaxelEstimator:
         exact = covariances.astype(np.float64)
         if not np.isfinite(exact).all() or not (np.linalg.eigvalsh(exact)[:, 0] > -ridge_of(exact)).all():
             raise EdgeError("covariances are not positive definite: freeze them again")
-        self._grid_shape = grid_shape
         self._covariances = ridged(exact)
 
-    def filler(self, dead: NDArray[np.bool_]) -> "Filler":
-        """Return the filler for the taxels `dead` (rows, cols), some of which must be alive."""
-        if dead.shape != self._grid_shape or dead.all():
-            raise EdgeError(
-                f"{np.count_nonzero(dead)} dead taxels of {dead.shape}, expected fewer, of {self._grid_shape}"
-            )
-        return Filler(dead, self._covariances)
+    def filler(self, dead: NDArray[np.bool_]) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+        """Return what puts estimates in the place of `dead` taxels (rows, cols), not all, into scans of zeroed counts.
 
-
-class Filler:
-    """Filler for the same dead taxels scan after scan; computes once all that does not depend on readings."""
-
-    def __init__(self, dead: NDArray[np.bool_], covariances: NDArray[np.float64]) -> None:
+        All that does not depend on the readings is computed once.
+        """
         off = np.tile(dead.ravel(), len(AXES))
-        self._dead, self._live = np.flatnonzero(off), np.flatnonzero(~off)
-        living = covariances[:, self._live[:, None], self._live]
-        self._kinds = Kinds(living)
-        self._maps = np.linalg.solve(living, covariances[:, self._live[:, None], self._dead]).transpose(0, 2, 1)
+        lost, live = np.flatnonzero(off), np.flatnonzero(~off)
+        living = self._covariances[:, live[:, None], live]
+        kinds = Kinds(living)
+        maps = np.linalg.solve(living, self._covariances[:, live[:, None], lost]).transpose(0, 2, 1)
 
-    def __call__(self, zeroed: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return one scan (3, rows, cols) in zeroed counts with estimates in the place of dead taxels."""
-        living = zeroed.ravel()[self._live].astype(np.float64)
-        counts = zeroed.copy()
-        counts.flat[self._dead] = self._kinds.weigh(living[None])[0] @ (self._maps @ living)
-        return counts
+        def fill(zeroed: NDArray[np.float32]) -> NDArray[np.float32]:
+            readings = zeroed.ravel()[live].astype(np.float64)
+            counts = zeroed.copy()
+            counts.flat[lost] = kinds.weigh(readings[None])[0] @ (maps @ readings)
+            return counts
+
+        return fill
 
 
 class Kinds:

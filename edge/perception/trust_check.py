@@ -38,6 +38,64 @@ longer than 3."""
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
 
 
+class SensorPad:
+    """Constants and gains of a sensor, which may be learned while it runs.
+
+    Attributes:
+        counts_per_newton: of the sensor, if known; it stands for those that the pad lacks.
+        pad: as it was given; None if nothing is known.
+        row: the constants as model input.
+        outside: it is far outside those of the training.
+        operator: of the model's checks for this pad, from a pattern and its traction to readings; None without checks.
+        gain_error: standard deviation that remains of the gains.
+        counts_per_unit: (3, rows or 1, cols or 1), counts of a network unit, with the gains that the model wants out.
+        gains_certainty: of these gains; None without.
+        wrench_origin: whether the model gets the sensor's counts per newton.
+        scale_error: how far its counts per newton may be off, as a share of them, at an end of their 90 % interval; of
+            all sensors that the model was trained for where it takes none of its own, None where they have no interval.
+    """
+
+    def __init__(
+        self,
+        contract: Contract,
+        trust: Trust | None,
+        pad: Pad | None,
+        counts_per_newton: float | None,
+        interval: tuple[float, float] | None = None,
+    ) -> None:
+        self._interval = interval  # of these counts per newton
+        self.counts_per_newton, self._contract, self._trust = counts_per_newton, contract, trust
+        self.use(pad)
+
+    def use(self, pad: Pad | None) -> None:
+        """Take a pad from now on, converted once for all runs of the model."""
+        contract, self.pad = self._contract, pad
+        pad = with_scale(pad, self.counts_per_newton, self._interval)
+        self.row: NDArray[np.float32] = contract.pad_row(pad)
+        self.counts_per_unit = np.asarray(contract.counts_per_unit, dtype=np.float32)[:, None, None]
+        if contract.takes_gains and pad is not None and pad.gains is not None:
+            gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
+            self.counts_per_unit = self.counts_per_unit * gains
+        self.gains_certainty = None if pad is None or pad.gains is None else pad.gains_certainty
+        self.outside = contract.is_outside(pad)
+        self.gain_error = GAIN_SPREAD * (1 - (float(self.row[-1]) if contract.takes_gains else 0.0))
+        taken = [name for name, _, _ in contract.pad_inputs]
+        self.operator = None if self._trust is None else self._trust.forward.of_pad(self.row[: len(taken)])
+        per_newton = None if pad is None else pad.counts_per_newton
+        self.wrench_origin: WrenchOrigin = "nominal"
+        self.scale_error: float | None = None
+        if "counts_per_newton" in taken:
+            at = taken.index("counts_per_newton")
+            _, centre, spread = contract.pad_inputs[at]
+            if self.row[len(taken) + at]:
+                self.wrench_origin = "calibrated"
+            else:  # unknown, or too little: the model is given none
+                per_newton, self.scale_error = None, 0.9 * spread / centre  # pads were drawn evenly
+        if pad is not None and per_newton is not None and "counts_per_newton" in pad.intervals:
+            low, high = pad.intervals["counts_per_newton"]
+            self.scale_error = max(high - per_newton, per_newton - low) / per_newton
+
+
 class TrustVerdict(NamedTuple):
     """Outcome of the checks of one pattern."""
 
@@ -49,12 +107,18 @@ class TrustVerdict(NamedTuple):
 class PatternCheck:
     """Checks of one sensor's patterns and of the earlier taps that they are made from, with what its contacts show."""
 
-    def __init__(self, trust: Trust, contract: Contract, report: Report = lambda kind, detail="": None) -> None:
+    def __init__(
+        self,
+        trust: Trust,
+        contract: Contract,
+        pad: SensorPad | None = None,
+        report: Report = lambda kind, detail="": None,
+    ) -> None:
+        """Check with the pad that is in use, None for one of which nothing is known."""
         self._trust, self._report = trust, report
-        self._constants, self._takes_gains = len(contract.pad_inputs), contract.takes_gains
+        self._pad = SensorPad(contract, trust, None, None) if pad is None else pad
         self._unit_counts = contract.counts_per_unit[2]
         self._deepest = 1.1 * contract.output_full_scale  # a little more than the deepest press in training
-        self.use_pad(np.zeros(contract.pad_width, dtype=np.float32))
         self._evidence = 0.0
         self._tap: int | None = None
         self._strongest, self._score = -math.inf, 0.0
@@ -63,13 +127,6 @@ class PatternCheck:
     def suspect_file(self) -> None:
         """Believe no further pattern: the sensor file holds the gains of another sensor."""
         self.suspected = self._wrong_file = True
-
-    def use_pad(self, pad_row: NDArray[np.float32], *, outside: bool = False) -> None:
-        """Check from now on with a pad as model input, maybe far outside those of the training; the evidence stays."""
-        self._pad_row, self._outside = pad_row, outside
-        self._operator = self._trust.forward.of_pad(pad_row[: self._constants])
-        certainty = float(pad_row[-1]) if self._takes_gains else 0.0
-        self._gain_error = GAIN_SPREAD * (1 - certainty)
 
     def belonging(
         self, window: NDArray[np.float32], taps: int, poses: NDArray[np.float32] | None = None
@@ -125,20 +182,20 @@ class PatternCheck:
         z_counts = strength * self._unit_counts
         if z_counts < LEAST_COUNTS:
             return TrustVerdict(False, "stuck") if repeats >= REPEATS else TrustVerdict(None)
-        trust = self._trust
-        (score,) = trust.contact.network(contact_features(newest, self._pad_row))
+        trust, pad = self._trust, self._pad
+        (score,) = trust.contact.network(contact_features(newest, pad.row))
         if tap != self._tap:
             self._begin_contact(tap)
         if strength > self._strongest and math.isfinite(score):
             self._strongest, self._score = strength, score
-        mismatch, explained = None, True
-        if traction is not None:
-            mismatch = trust.forward.mismatch(self._operator, newest, pattern, traction, self._gain_error)
+        mismatch, explained = None, traction is None
+        if traction is not None and pad.operator is not None:
+            mismatch = trust.forward.mismatch(pad.operator, newest, pattern, traction, pad.gain_error)
             explained = mismatch <= MOST_MISMATCH and np.isfinite(traction).all()
         reason: Reason | None = None
         if repeats >= REPEATS:
             reason = "stuck"
-        elif self._outside:
+        elif pad.outside:
             reason = "pad"
         elif not score <= trust.contact.limit or _alternates(newest[2]):  # NaN fails here too, as below
             reason = "unfamiliar"
@@ -202,58 +259,3 @@ def _which(number: int, *, alone: bool) -> str:
         return "the tap before does"
     ordinal = {2: "2nd", 3: "3rd"}.get(number, f"{number}th")  # of six earlier taps at most
     return f"the {ordinal} tap before does" if alone else f"taps from the {ordinal} before on do"
-
-
-class SensorPad:
-    """Constants and gains of a sensor, which may be learned while it runs.
-
-    Attributes:
-        check: of the sensor's patterns, which takes the pad, too; None without.
-        counts_per_newton: of the sensor, if known; it stands for those that the pad lacks.
-        pad: as it was given; None if nothing is known.
-        row: the constants as model input.
-        counts_per_unit: (3, rows or 1, cols or 1), counts of a network unit, with the gains that the model wants out.
-        gains_certainty: of these gains; None without.
-        wrench_origin: whether the model gets the sensor's counts per newton.
-        scale_error: how far its counts per newton may be off, as a share of them, at an end of their 90 % interval; of
-            all sensors that the model was trained for where it takes none of its own, None where they have no interval.
-    """
-
-    def __init__(
-        self,
-        contract: Contract,
-        pad: Pad | None,
-        counts_per_newton: float | None,
-        check: PatternCheck | None,
-        interval: tuple[float, float] | None = None,
-    ) -> None:
-        self._interval = interval  # of these counts per newton
-        self.check, self.counts_per_newton, self._contract = check, counts_per_newton, contract
-        self.use(pad)
-
-    def use(self, pad: Pad | None) -> None:
-        """Take a pad from now on, converted once for all runs of the model."""
-        contract, self.pad = self._contract, pad
-        pad = with_scale(pad, self.counts_per_newton, self._interval)
-        self.row: NDArray[np.float32] = contract.pad_row(pad)
-        self.counts_per_unit = np.asarray(contract.counts_per_unit, dtype=np.float32)[:, None, None]
-        if contract.takes_gains and pad is not None and pad.gains is not None:
-            gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
-            self.counts_per_unit = self.counts_per_unit * gains
-        if self.check is not None:
-            self.check.use_pad(self.row, outside=contract.is_outside(pad))
-        self.gains_certainty = None if pad is None or pad.gains is None else pad.gains_certainty
-        taken = [name for name, _, _ in contract.pad_inputs]
-        per_newton = None if pad is None else pad.counts_per_newton
-        self.wrench_origin: WrenchOrigin = "nominal"
-        self.scale_error: float | None = None
-        if "counts_per_newton" in taken:
-            at = taken.index("counts_per_newton")
-            _, centre, spread = contract.pad_inputs[at]
-            if self.row[len(taken) + at]:
-                self.wrench_origin = "calibrated"
-            else:  # unknown, or too little: the model is given none
-                per_newton, self.scale_error = None, 0.9 * spread / centre  # pads were drawn evenly
-        if pad is not None and per_newton is not None and "counts_per_newton" in pad.intervals:
-            low, high = pad.intervals["counts_per_newton"]
-            self.scale_error = max(high - per_newton, per_newton - low) / per_newton

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
@@ -108,52 +108,49 @@ class Commands:
         return commands
 
 
-class CommandLines:
-    """Producer of commands from lines of a file descriptor, which a thread reads as soon as they come.
+@contextmanager
+def command_lines(commands: Commands, descriptor: int) -> Iterator[None]:
+    """Take lines of a file descriptor as commands within a with statement, in a thread, as soon as they come.
 
-    A pose without a time has that of its arrival, and the loop may be waiting for a scan.
+    A pose without a time has that of its arrival, and the loop may be waiting for a scan. The descriptor stays open.
     """
+    woken, waking = os.pipe()
 
-    def __init__(self, commands: Commands, descriptor: int) -> None:
-        self._commands, self._descriptor = commands, descriptor
-        self._woken, self._waking = os.pipe()
-        self._thread = threading.Thread(target=self._follow, name="command-lines", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """End the thread; the descriptor stays open."""
-        os.write(self._waking, b"!")
-        self._thread.join()
-        for end in (self._woken, self._waking):
-            os.close(end)
-
-    def _follow(self) -> None:
+    def follow() -> None:
         data, partial = b"\n", b""
         with suppress(OSError, ValueError):  # the other end is gone, which ends commands but not the run
             while data:
-                if self._woken in select.select([self._descriptor, self._woken], [], [])[0]:
+                if woken in select.select([descriptor, woken], [], [])[0]:
                     return
-                data = os.read(self._descriptor, 1 << 16)  # all that a pipe holds, some 500 poses
+                data = os.read(descriptor, 1 << 16)  # all that a pipe holds, some 500 poses
                 *lines, partial = (partial + (data or b"\n")).split(b"\n")
                 partial = partial[: LONGEST_BYTES + 1]
                 for line in lines:
-                    self._parse(line)
+                    _take_line(commands, line)
 
-    def _parse(self, line: bytes) -> None:
-        if not line.strip():
-            return
-        parsed = json_object(line) or {}
-        if parsed.get("cmd") == "pose":
-            self._commands.poses.put_fields(parsed, time.monotonic_ns())
-            return
-        command = runtime_command(parsed)
-        if command is None:
-            shown = ascii(line[:60].decode(errors="replace"))
-            self._commands.refuse(
-                f"a line on stdin is refused: {shown}{'...' * (len(line) > 60)}, expected {FORMS}, or a pose"
-            )
-        else:
-            self._commands.put(command)
+    thread = threading.Thread(target=follow, name="command-lines", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        os.write(waking, b"!")
+        thread.join()
+        for end in (woken, waking):
+            os.close(end)
+
+
+def _take_line(commands: Commands, line: bytes) -> None:
+    if not line.strip():
+        return
+    parsed = json_object(line) or {}
+    command = runtime_command(parsed)
+    if parsed.get("cmd") == "pose":
+        commands.poses.put_fields(parsed, time.monotonic_ns())
+    elif command is not None:
+        commands.put(command)
+    else:
+        shown = ascii(line[:60].decode(errors="replace"))
+        commands.refuse(f"a line on stdin is refused: {shown}{'...' * (len(line) > 60)}, expected {FORMS}, or a pose")
 
 
 def runtime_command(parsed: Mapping[str, Any]) -> Command | None:
@@ -175,15 +172,11 @@ def read_stdin(commands: Commands) -> Iterator[None]:
 
     Only on POSIX can a pipe be polled for data.
     """
-    lines: CommandLines | None = None
-    if os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and not sys.stdin.isatty():
-        with suppress(OSError):  # a replaced stdin is not a file of the system
-            lines = CommandLines(commands, sys.stdin.fileno())
-    try:
+    with ExitStack() as reading:
+        if os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and not sys.stdin.isatty():
+            with suppress(OSError):  # a replaced stdin is not a file of the system
+                reading.enter_context(command_lines(commands, sys.stdin.fileno()))
         yield
-    finally:
-        if lines is not None:
-            lines.close()
 
 
 KEYS: Final = {ord("r"): RESET, ord("z"): ZERO, ord("Z"): Command("zero", force=True)}

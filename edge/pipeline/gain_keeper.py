@@ -11,15 +11,10 @@ from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 
 
 class GainKeeper:
-    """Keeper of the gains that the sensors of one file have learned.
-
-    Attributes:
-        trouble: why the last ones could not be kept, once it is closed; None if they were.
-    """
+    """Keeper of the gains that the sensors of one file have learned."""
 
     def __init__(self, path: Path, *, emulated: bool) -> None:
         """Prepare to keep gains in a sensor file; emulated sensors leave that of a real one alone."""
-        self.trouble: str | None = None
         self._path, self._emulated = path, emulated
         self._writer = ThreadPoolExecutor(1, "gain-keeper")
         self._written: Future[None] | None = None
@@ -28,14 +23,15 @@ class GainKeeper:
         """Begin to write the learned gains of a sensor, which must not wait."""
         self._written = self._writer.submit(keep_learned, self._path, sensor, learned, emulated=self._emulated)
 
-    def close(self) -> None:
-        """Wait until all is written."""
+    def close(self) -> str | None:
+        """Wait until all is written, and return why the last gains could not be kept; None if they were."""
         self._writer.shutdown()
         try:
             if self._written is not None:
                 self._written.result()
         except SensorFileError as error:
-            self.trouble = str(error)
+            return str(error)
+        return None
 
 
 def keep_learned(path: Path, sensor: str, learned: Pad, *, emulated: bool = False) -> None:

@@ -98,7 +98,6 @@ class Loop:
         self._intake = PoseIntake(runtime, self._poses, refused=refused, unused_by=unused_by)
         self._cadences = Cadences(runtime.expected, recorded=source.kind == "replay", rate_hz=source.rate_hz)
         self._first_ns: int | None = None
-        self._now_ns = 0  # time of a patient source
         self._waited_ns = self._refused_ns = -math.inf
         self._clock_ns = clock_ns
         self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
@@ -183,7 +182,7 @@ class Loop:
         """Pass on what waits: commands, poses, and scans that are to be followed; False where no more will come."""
         source, runtime = self._source, self._runtime
         taken = source.take(wait_s)
-        if taken is None or (source.patient and self._is_too_long(taken)):
+        if taken is None or (source.patient and self._is_too_long()):
             return False
         for command in self._commands.poll():
             command.carry_out(runtime)
@@ -204,21 +203,18 @@ class Loop:
             self._rest(wait_s)
         return True
 
-    def _is_too_long(self, taken: Sequence[Scan | Notice | TimedPose]) -> bool:
+    def _is_too_long(self) -> bool:
         """Return whether the time of a patient source, which is that of its scans, is over."""
-        for arrival in taken:
-            if isinstance(arrival, Scan):
-                self._now_ns = arrival.time_ns
-                self._first_ns = arrival.time_ns if self._first_ns is None else self._first_ns
-        return self._first_ns is not None and self._now_ns - self._first_ns >= self._length_ns
+        last_ns = self._source.last_ns
+        self._first_ns = last_ns if self._first_ns is None else self._first_ns
+        return last_ns is not None and self._first_ns is not None and last_ns - self._first_ns >= self._length_ns
 
     def _finish(self) -> None:
         """Keep what was learned; there are no more results."""
         if self._keeper is not None:
             keeper, self._keeper = self._keeper, None
-            keeper.close()
-            if keeper.trouble is not None:
-                self._tell(Event(self._clock_ns(), "note", None, f"learned gains are not kept: {keeper.trouble}"))
+            if (trouble := keeper.close()) is not None:
+                self._tell(Event(self._clock_ns(), "note", None, f"learned gains are not kept: {trouble}"))
         self._tally()
         if self._sinks:
             troubles = [sink.trouble for sink in self._sinks if sink.trouble is not None]
@@ -258,7 +254,7 @@ class Loop:
         """Pass poses on to the runtime: those from outside, and those of the source."""
         recorded = [pose for pose in taken if isinstance(pose, TimedPose)]
         first_ns = min((scan.time_ns for scan in taken if isinstance(scan, Scan)), default=None)
-        now_ns = self._now_ns if self._source.patient else self._clock_ns()
+        now_ns = (self._source.last_ns or 0) if self._source.patient else self._clock_ns()
         poses = self._intake.take(recorded, first_ns, now_ns, self._no_sensor)
         for sink in self._sinks if poses else ():
             sink.pose(poses)

@@ -57,30 +57,26 @@ def open_recording(
     tracks = [track for recording in replay.recordings for track in recording.tracks]
     # A sensor file names the pad; without one the recording's grid does.
     file = sensor_settings(sensor, unmapped(tracks[0].geometry) if sensor is None else None)
-    known = with_recorded(file, [replay])
-    recorded = [_in_its_time(recording, paced=paced) for recording in replay.recordings]
-    baselines = {} if zero else {name: one for each in recorded for name, one in each.items()} or known.baselines
-    mountings = known.mountings
+    stored = with_recorded(file, [replay])
+    baselines: dict[str, Baseline] = {}
+    for recording in () if zero else replay.recordings:
+        baselines |= _in_its_time(recording, paced=paced)
     if not zero:
-        baselines = free_baselines(replay, mountings, baselines, rate_hz=rate_hz) | dict(baselines)
-    sensors = {*mountings, *baselines}
+        baselines = baselines or stored.baselines
+        baselines |= free_baselines(replay, stored.mountings, baselines, rate_hz=rate_hz)
+    sensors = {*stored.sensors, *baselines}
     if sensor is None:  # else a note reports the sensors that the file lacks
         sensors |= {track.sensor for track in tracks}
+    as_wired = SensorEntry(Mounting(taxel_count=file.geometry.taxel_count))
     entries = {
-        name: replace(
-            known.sensors.get(name, SensorEntry()),
-            mounting=mountings.get(name, Mounting(taxel_count=file.geometry.taxel_count)),
-            baseline=baselines.get(name),
-        )
-        for name in sorted(sensors)
+        name: replace(stored.sensors.get(name, as_wired), baseline=baselines.get(name)) for name in sorted(sensors)
     }
-    known = replace(known, sensors=entries)
     place_recordings(replay, file.mountings)
-    return Source(replay, sensor_file=known, rate_hz=rate_hz)
+    return Source(replay, sensor_file=replace(stored, sensors=entries), rate_hz=rate_hz)
 
 
 def recorded_baselines(
-    text: str, known: SensorFile, rate_hz: float | None, *, force: bool
+    text: str, sensor_file: SensorFile, rate_hz: float | None, *, force: bool
 ) -> tuple[dict[str, Baseline], list[str]]:
     """Return the baselines of FILE[,FILE], from where each pad is free and still, and notes where that is.
 
@@ -93,8 +89,8 @@ def recorded_baselines(
         SourceError: its rate is unknown or out of range.
     """
     replay = ReplayLink(recording_paths(text), rate_hz)
-    refuse_emulated(known, replay.kind, replay.origin, force)
-    baselines = free_baselines(replay, with_recorded(known, [replay]).mountings, opening=True, rate_hz=rate_hz)
+    refuse_emulated(sensor_file, replay.kind, replay.origin, force)
+    baselines = free_baselines(replay, with_recorded(sensor_file, [replay]).mountings, opening=True, rate_hz=rate_hz)
     sensors = {track.sensor for recording in replay.recordings for track in recording.tracks}
     notes = [notice.text for notice in replay.notices()]
     if sensors - baselines.keys():
@@ -106,12 +102,12 @@ def recorded_baselines(
 def free_baselines(
     replay: ReplayLink,
     mountings: Mapping[str, Mounting],
-    known: Mapping[str, Baseline] = MappingProxyType({}),
+    stored: Mapping[str, Baseline] = MappingProxyType({}),
     *,
     opening: bool = False,
     rate_hz: float | None = None,
 ) -> dict[str, Baseline]:
-    """Return the baselines of sensors that have none in `known`, from where the recordings are free and still.
+    """Return the baselines of sensors that have none in `stored`, from where the recordings are free and still.
 
     The replay gets a note for each sensor. `mountings` are those of taxels that still have to be put in place. With
     `opening` the first scans count, too, from which a live run would zero by itself: for baselines that are kept.
@@ -122,7 +118,7 @@ def free_baselines(
         held = _remedy(recording.path, rate_hz)
         for track in recording.tracks:
             name = track.sensor
-            if name in known or len(track.counts) < FEWEST_RECORDED:
+            if name in stored or len(track.counts) < FEWEST_RECORDED:
                 continue
             try:
                 stretch = free_stretch(track.counts)
@@ -189,6 +185,6 @@ def _in_its_time(recording: Recording, *, paced: bool) -> dict[str, Baseline]:
     firsts_ns = {track.sensor: track.time_ns[0] for track in recording.tracks if track.time_ns is not None}
     now_s = time.time()
     return {
-        name: replace(one, created_unix_s=now_s - (firsts_ns[name] / 1e9 - one.created_unix_s))
-        for name, one in baselines.items()
+        name: replace(baseline, created_unix_s=now_s - (firsts_ns[name] / 1e9 - baseline.created_unix_s))
+        for name, baseline in baselines.items()
     }

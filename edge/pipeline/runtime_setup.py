@@ -89,7 +89,7 @@ def open_runtime(
         geometry=sensor_file.geometry,
         baselines=of_single_csv(stored_baselines(baselines, sensor_file), source.name),
         counts_per_newton=(sensor_file.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
-        scale_intervals=sensor_file.scale_intervals if counts_per_newton is None else None,
+        scale_intervals=sensor_file.scale_intervals if counts_per_newton is None else {},
         mountings=sensor_file.mountings,
         pad=sensor_file.pads if pad is None else pad,
         measured=sensor_file.measured_pads if pad is None else None,

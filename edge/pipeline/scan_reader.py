@@ -41,6 +41,7 @@ class Source:
         sensor_file: properties of its sensors.
         rate_hz: requested rate of each sensor, in [Hz]; None without.
         overruns: scans discarded.
+        last_ns: time of the last scan taken of a patient link, in [ns]; None before.
         pace: the times of reading its links; any thread may set it.
     """
 
@@ -73,7 +74,7 @@ class Source:
         self.pace = ReadingPace()
         self._stop = threading.Event()
         self._readers = [LinkReader(link, give_up_s, sleep=self._stop.wait) for link in links]
-        self._last_ns = 0
+        self.last_ns: int | None = None
         self._opened = self._closed = False
         self._open = ExitStack()
         self._threads: list[threading.Thread] = []
@@ -181,7 +182,7 @@ class Source:
     def unix_time_s(self) -> float:
         """Return the time in [s] since 1970: now, or for a patient source that of the last scan taken."""
         offset_ns = self.unix_offset_ns
-        return time.time() if offset_ns is None else (self._last_ns + offset_ns) / 1e9
+        return time.time() if offset_ns is None else ((self.last_ns or 0) + offset_ns) / 1e9
 
     def take(self, timeout_s: float) -> list[Scan | Notice | TimedPose] | None:
         """Return all that waits, in order, after waiting at most `timeout_s` for it; None when no more will come.
@@ -224,7 +225,7 @@ class Source:
         if reader.link.ended:
             return None
         scans = reader.read(timeout_s)
-        self._last_ns = scans[-1].time_ns if scans else self._last_ns
+        self.last_ns = scans[-1].time_ns if scans else self.last_ns
         return [*reader.notices(), *reader.link.poses(), *scans]
 
     def _started(self, reader: LinkReader) -> threading.Thread:

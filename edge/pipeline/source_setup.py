@@ -33,18 +33,18 @@ def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) ->
         return SensorFile(id_map.name, own_map=id_map)
     if id_map not in (None, *ID_MAPS):
         raise UsageError(f"id map is {id_map!r}, expected one of: {', '.join(ID_MAPS)}")
-    known = SensorFile(id_map or USPA44_MAP.name) if sensor is None else load_sensor_file(sensor)
-    if id_map not in (None, known.model):
+    sensor_file = SensorFile(id_map or USPA44_MAP.name) if sensor is None else load_sensor_file(sensor)
+    if id_map not in (None, sensor_file.model):
         raise UsageError(
-            f"id map {id_map}, but {sensor} is of a {known.model}, and so are its order and baseline: "
+            f"id map {id_map}, but {sensor} is of a {sensor_file.model}, and so are its order and baseline: "
             "leave one of them out"
         )
-    return known
+    return sensor_file
 
 
 def links_to(
     texts: Sequence[str],
-    known: SensorFile,
+    sensor_file: SensorFile,
     *,
     rate_hz: float | None = None,
 ) -> list[Link]:
@@ -57,20 +57,20 @@ def links_to(
     for text in texts:
         if not isinstance(text, str):
             raise UsageError(f"source is {text!r}, expected text, as after --source; of several each by itself")
-    if not texts and known.adapter is not None:
-        texts = [f"slcan:serial={known.adapter}"]
+    if not texts and sensor_file.adapter is not None:
+        texts = [f"slcan:serial={sensor_file.adapter}"]
     demo = any(text.rpartition("=")[2] in ("demo", DEMO_LOOP) for text in texts)
     recording = demo_recording() if demo else None
-    return open_sources(texts, rate_hz, recording, known.model_map, mountings=known.mountings)
+    return open_sources(texts, rate_hz, recording, sensor_file.model_map, mountings=sensor_file.mountings)
 
 
-def with_recorded(known: SensorFile, links: Iterable[Link]) -> SensorFile:
+def with_recorded(sensor_file: SensorFile, links: Iterable[Link]) -> SensorFile:
     """Return the settings, with the recorded mountings of sensors that they do not name."""
     recorded = {name: SensorEntry(mounting) for link in links for name, mounting in link.mountings.items()}
-    return replace(known, sensors=recorded | dict(known.sensors))
+    return replace(sensor_file, sensors=recorded | dict(sensor_file.sensors))
 
 
-def refuse_emulated(known: SensorFile, kind: SourceKind, origin: SourceKind | None, force: bool) -> None:
+def refuse_emulated(sensor_file: SensorFile, kind: SourceKind, origin: SourceKind | None, force: bool) -> None:
     """Refuse to use settings of an emulated sensor on a device, or on a recording of anything else, unless forced.
 
     Raises:
@@ -81,7 +81,7 @@ def refuse_emulated(known: SensorFile, kind: SourceKind, origin: SourceKind | No
     this, instead = "is a device", "add --force"
     if kind == "replay":
         this, instead = "recording is not known to be of one", "leave --sensor out"
-    for name, entry in known.sensors.items():
+    for name, entry in sensor_file.sensors.items():
         if entry.emulated:
             parts = ", ".join(part for part in PARTS if part in entry.emulated)
             raise SensorFileError(
@@ -91,12 +91,12 @@ def refuse_emulated(known: SensorFile, kind: SourceKind, origin: SourceKind | No
 
 
 def stored_baselines(
-    baselines: Mapping[str, Baseline] | str | Path | None, known: SensorFile
+    baselines: Mapping[str, Baseline] | str | Path | None, sensor_file: SensorFile
 ) -> Mapping[str, Baseline]:
     """Return the baselines of free pads: stored ones, or their file, before those of the sensor file."""
     if isinstance(baselines, (str, Path)):
-        return load_baselines(baselines, known.orders)
-    return known.baselines if baselines is None else baselines
+        return load_baselines(baselines, sensor_file.orders)
+    return sensor_file.baselines if baselines is None else baselines
 
 
 def of_single_csv(baselines: Mapping[str, Baseline], played: str) -> Mapping[str, Baseline]:

@@ -123,14 +123,6 @@ def _pose_arrays(poses: Sequence[TimedPose]) -> dict[str, NDArray[Any]]:
     }
 
 
-def recorded_rows(path: Path, geometry: SensorGeometry, origin: str) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a recording that `load_recording` has read, in the order of its messages.
-
-    Raises a RecordingError where a result or a map cannot be read.
-    """
-    yield from _Rows(path, geometry, origin).rows()
-
-
 class _Topic(NamedTuple):
     sensor: str
     name: str
@@ -138,7 +130,12 @@ class _Topic(NamedTuple):
     factor: float  # of a map to its unit
 
 
-class _Rows:
+class RecordedRows:
+    """Rows of a recording that `load_recording` has read, in the order of its messages.
+
+    Going over them raises a RecordingError where a result or a map cannot be read.
+    """
+
     def __init__(self, path: Path, geometry: SensorGeometry, origin: str) -> None:
         self._path, self._geometry, self._origin = path, geometry, origin
         self._baselines: dict[str, Baseline] = {}
@@ -146,7 +143,7 @@ class _Rows:
         self._of = ""
         self._row: dict[str, Any] | None = None
 
-    def rows(self) -> Iterator[dict[str, Any]]:
+    def __iter__(self) -> Iterator[dict[str, Any]]:
         try:
             with self._path.open("rb") as file:
                 for message in messages(file, self._topic_of):

@@ -19,7 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from fcntl import ioctl
 from http import HTTPStatus
-from typing import Final, NamedTuple
+from typing import Final
 from urllib.parse import parse_qs
 
 from edge.errors import UsageError
@@ -28,13 +28,6 @@ PAGE: Final = "/"
 SOCKET: Final = "/ws"
 SHORTEST_TOKEN: Final = 12
 _HOST: Final = re.compile(r"(?:\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[\w.-]+))(?::[0-9]*)?")
-
-
-class Refusal(NamedTuple):
-    """Refusal of a request: status and reason."""
-
-    status: HTTPStatus
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +42,8 @@ class Access:
     name: str
     token: str | None
 
-    def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> Refusal | None:
-        """Return the refusal of a request; None if it is granted.
+    def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> tuple[HTTPStatus, str] | None:
+        """Return status and reason with which a request is refused; None if it is granted.
 
         The path has its query; `hosts` and `origins` are the values of these headers, the latter of browsers alone.
         """
@@ -58,7 +51,7 @@ class Access:
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
             remedy = "open the address that edge-sr printed when it started, or name this one with --view-host"
             proxies = "a proxy must send the host and port of edge-sr as Host"
-            return Refusal(HTTPStatus.FORBIDDEN, f"this server is not called {called}; {remedy}; {proxies}")
+            return HTTPStatus.FORBIDDEN, f"this server is not called {called}; {remedy}; {proxies}"
         place, _, query = path.partition("?")
         given = parse_qs(query)
         # A browser sends no origin when a page asks why its socket was refused, so that the page names its own.
@@ -69,13 +62,13 @@ class Access:
                 text = f"pages of {', '.join(origins)} may not send requests to this server"
                 if place == SOCKET:
                     text += ": pass --view-token T to edge-sr, and add ?token=T to the page's address"
-                return Refusal(HTTPStatus.FORBIDDEN, text)
+                return HTTPStatus.FORBIDDEN, text
         if place not in (PAGE, SOCKET):
-            return Refusal(HTTPStatus.NOT_FOUND, f"there is only {PAGE}")
+            return HTTPStatus.NOT_FOUND, f"there is only {PAGE}"
         # The page alone shows nothing, and removes the token from the address bar: it must open again without it.
         if place == SOCKET and self.token is not None and not trusted:
             text = "the token is missing or wrong: open the address that edge-sr printed when it started"
-            return Refusal(HTTPStatus.FORBIDDEN, text)
+            return HTTPStatus.FORBIDDEN, text
         return None
 
     def urls(self, port: int, addresses: Sequence[str] = ()) -> list[str]:

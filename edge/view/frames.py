@@ -7,7 +7,7 @@ and a deque is copied in one step, so no reader sees half of anything, and no lo
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -61,20 +61,11 @@ class Newest(NamedTuple):
     rate_hz: float | None
 
 
-class NumberedEvent(NamedTuple):
-    """Event of the run, numbered from 1, with its time of arrival."""
-
-    number: int
-    event: Event
-    counters: Mapping[str, int]
-    received_ns: int
-
-
 class RunSnapshot(Sink):
     """Newest result and trace of every sensor, and the latest events, in memory that does not grow with the run.
 
     Attributes:
-        newest: by sensor.
+        sensors: their traces by name.
         first_ns: time of the run's first scan, in [ns]; None before.
         map: newest state of the map; None where none is made.
         truth_of: the true pattern of a result, (H, W) in its unit, where the simulation states one; else None.
@@ -83,37 +74,28 @@ class RunSnapshot(Sink):
     """
 
     def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self.newest: dict[str, Newest] = {}
+        self.sensors: dict[str, SensorTrace] = {}
         self.first_ns: int | None = None
         self.map: MapState | None = None
         self.truth_of: Truth = lambda result: None
         self.wake: Callable[[], object] = lambda: None
         self._clock_ns = clock_ns
-        self._traces: dict[str, _Trace] = {}
-        self._events: deque[NumberedEvent] = deque(maxlen=EVENTS)
+        self._events: deque[tuple[int, int, Event, Mapping[str, int]]] = deque(maxlen=EVENTS)
         self._events_count = 0
         self._due_ns = 0
         self._unseen = False
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Add a result."""
-        scan = result.scan
+        scan, received_ns = result.scan, self._clock_ns()
         if self.first_ns is None:
             self.first_ns = scan.time_ns
-        trace = self._traces.get(scan.sensor)
-        if trace is None:
-            trace = _Trace()
-            # Replaced, not added to, so that a reader can iterate over the old one.
-            self._traces = {**self._traces, scan.sensor: trace}
-        trace.add(result)
+        trace = self.sensors.get(scan.sensor) or SensorTrace()
+        trace.add(result, counters, received_ns)
+        if scan.sensor not in self.sensors:  # replaced, not added to, so that a reader can iterate over the old one
+            self.sensors = {**self.sensors, scan.sensor: trace}
         for event in result.events:
             self._add_event(event, counters)
-        received_ns = self._clock_ns()
-        newest = Newest(trace.number, result, counters, received_ns, trace.cadence.rate_hz)
-        if scan.sensor in self.newest:
-            self.newest[scan.sensor] = newest
-        else:
-            self.newest = {**self.newest, scan.sensor: newest}
         self._news(received_ns)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
@@ -126,17 +108,13 @@ class RunSnapshot(Sink):
         if self._unseen:
             self._news(self._clock_ns())
 
-    def events(self, since: int) -> list[NumberedEvent]:
-        """Return the latest events after number `since`."""
-        return [event for event in self._events.copy() if event.number > since]
-
-    def points(self, sensor: str, since: int) -> list[Point]:
-        """Return the points of a sensor after number `since`: all, or if these are too many, one in 50 ms."""
-        return self._traces[sensor].points(since)
+    def events(self, since: int) -> list[tuple[int, int, Event, Mapping[str, int]]]:
+        """Return the latest events after number `since`: each one's number, time of arrival, and counters then."""
+        return [numbered for numbered in self._events.copy() if numbered[0] > since]
 
     def _add_event(self, event: Event, counters: Mapping[str, int]) -> None:
         self._events_count += 1
-        self._events.append(NumberedEvent(self._events_count, event, counters, self._clock_ns()))
+        self._events.append((self._events_count, self._clock_ns(), event, counters))
 
     def _news(self, now_ns: int) -> None:
         self._unseen = now_ns < self._due_ns
@@ -147,21 +125,24 @@ class RunSnapshot(Sink):
             self.wake()
 
 
-class _Trace:
-    """Values of one sensor against time."""
+class SensorTrace:
+    """Trace of one sensor: its newest result, and its values against time."""
+
+    newest: Newest
 
     def __init__(self) -> None:
-        self.number = 0
-        self.cadence = Cadence()
+        self._number = 0
+        self._cadence = Cadence()
         self._recent: deque[Point] = deque(maxlen=RECENT_SCANS)
         self._past: deque[Point] = deque(maxlen=TRACE_POINTS - 1)
 
-    def add(self, result: Result) -> None:
-        self.number += 1
+    def add(self, result: Result, counters: Mapping[str, int], received_ns: int) -> None:
+        """Add a result that was received at a time in [ns]."""
+        self._number += 1
         time_ns = result.scan.time_ns
-        self.cadence.follow(result.scan)
+        self._cadence.follow(result.scan)
         shear = None if result.wrench is None else result.wrench.shear_ratio
-        point = Point(self.number, time_ns, result.force_counts, result.area_mm2, result.force_n, shear)
+        point = Point(self._number, time_ns, result.force_counts, result.area_mm2, result.force_n, shear)
         self._recent.append(point)
         past = self._past
         step_ns = round(TRACE_S / TRACE_POINTS * 1e9)
@@ -169,8 +150,10 @@ class _Trace:
             past.append(point)
         elif (result.force_counts or 0.0) > (past[-1].force_counts or 0.0):
             past[-1] = point  # the highest of its 50 ms, so that a short tap is seen, too
+        self.newest = Newest(self._number, result, counters, received_ns, self._cadence.rate_hz)
 
     def points(self, since: int) -> list[Point]:
+        """Return the points after number `since`: all, or if these are too many, one in 50 ms."""
         recent = [point for point in self._recent.copy() if point.number > since]
         if not recent or recent[0].number == since + 1:
             return recent
@@ -181,36 +164,36 @@ class _Trace:
 
 
 class Frames:
-    """Frames of one moment; viewers at the same state get the same bytes.
+    """Frames of one moment, in [ns]; viewers at the same state get the same bytes.
 
     Attributes:
-        now_ns: the moment, in [ns].
+        newest: newest result of each sensor.
         map: state of the map; None where none is made.
     """
 
     def __init__(self, snapshot: RunSnapshot, now_ns: int, source: SourceKind | None) -> None:
-        self.now_ns = now_ns
-        self._source = source
-        self._snapshot = snapshot
-        self._newest = dict(snapshot.newest)
-        self._packed: dict[tuple[str, int], bytes] = {}
+        self._now_ns, self._source, self._snapshot = now_ns, source, snapshot
+        self.newest = {name: trace.newest for name, trace in snapshot.sensors.items()}
         self.map = snapshot.map
+        self._packed: dict[tuple[str, int], bytes] = {}
         self._map: bytes | None = None
-
-    @property
-    def numbers(self) -> dict[str, int]:
-        """Number of the newest result of every sensor."""
-        return {sensor: newest.number for sensor, newest in self._newest.items()}
 
     def result(self, sensor: str, since: int) -> bytes:
         """Return the newest result of a sensor, with the trace after number `since`."""
         if (sensor, since) not in self._packed:
-            self._packed[sensor, since] = self._pack(self._newest[sensor], since)
+            self._packed[sensor, since] = self._pack(sensor, since)
         return self._packed[sensor, since]
 
-    def events(self, since: int) -> list[tuple[int, bytes]]:
-        """Return the latest events after number `since`, with their numbers."""
-        return [(sent.number, self._event(sent)) for sent in self._snapshot.events(since)]
+    def events(self, since: int) -> Iterator[tuple[int, bytes]]:
+        """Yield the latest events after number `since`, with their numbers."""
+        for number, received_ns, event, counters in self._snapshot.events(since):
+            fields = event_record(event, counters, self._source)
+            yield number, _event(fields, self._now_ns - received_ns, {"number": number})
+
+    def silent(self) -> dict[str, float]:
+        """Return the silent sensors, and for how long each has been silent, in [s]."""
+        away_ns = {sensor: self._now_ns - newest.received_ns for sensor, newest in self.newest.items()}
+        return {sensor: round(ns / 1e9, 1) for sensor, ns in away_ns.items() if ns > SENSOR_SILENT_NS}
 
     def of_map(self, state: MapState) -> bytes:
         """Return the map, which is this state of it."""
@@ -220,16 +203,8 @@ class Frames:
             self._map = pack(header | {"pads": pads}, {"contact": state.contact})
         return self._map
 
-    def silent(self) -> dict[str, float]:
-        """Return the silent sensors, and for how long each has been silent, in [s]."""
-        away_ns = {sensor: self.now_ns - newest.received_ns for sensor, newest in self._newest.items()}
-        return {sensor: round(ns / 1e9, 1) for sensor, ns in away_ns.items() if ns > SENSOR_SILENT_NS}
-
-    def _event(self, sent: NumberedEvent) -> bytes:
-        fields = event_record(sent.event, sent.counters, self._source)
-        return _event(fields, self.now_ns - sent.received_ns, {"number": sent.number})
-
-    def _pack(self, newest: Newest, since: int) -> bytes:
+    def _pack(self, sensor: str, since: int) -> bytes:
+        newest = self.newest[sensor]
         result = newest.result
         first_ns = self._snapshot.first_ns or 0
         header: dict[str, Any] = {
@@ -238,11 +213,11 @@ class Frames:
             "note_kinds": [note.kind for note in result.notes],
             "untrusted_text": result.untrusted_text,
             "rate_hz": None if newest.rate_hz is None else round(newest.rate_hz, 2),
-            "age_s": _seconds(self.now_ns - newest.received_ns),
+            "age_s": _seconds(self._now_ns - newest.received_ns),
             # The loop may have added points since; they belong to the next frame, which begins after this one.
             "trace": [
                 _drawn(point, first_ns)
-                for point in self._snapshot.points(result.scan.sensor, since)
+                for point in self._snapshot.sensors[sensor].points(since)
                 if point.number <= newest.number
             ],
         }
@@ -333,11 +308,11 @@ class Viewer:
             due.append(frame)
         if self.paused:
             return due
-        for sensor, number in frames.numbers.items():
+        for sensor, newest in frames.newest.items():
             seen = self._seen.get(sensor, 0)
-            if number > seen:
+            if newest.number > seen:
                 due.append(frames.result(sensor, seen))
-                self._seen[sensor] = number
+                self._seen[sensor] = newest.number
         if frames.map is not None and frames.map is not self._seen_map:
             due.append(frames.of_map(frames.map))
             self._seen_map = frames.map

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
-from typing import ClassVar, Final, NamedTuple, Self
+from typing import ClassVar, Final, Self
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -46,30 +46,23 @@ SCRIPTS: Final = (
 """Files of the script in the order in which they are joined, so that they share one scope."""
 
 
-class Page(NamedTuple):
-    """Headers and body of an answer."""
-
-    headers: tuple[tuple[str, str], ...]
-    body: bytes
-
-
-def load_page() -> Page:
+def load_page() -> Response:
     """Return the page, with its style and its script inside: nothing else is fetched."""
     style = (FOLDER / "page.css").read_bytes()
     script = b"\n".join((FOLDER / name).read_bytes() for name in SCRIPTS)
     body = (FOLDER / "page.html").read_bytes()
     body = body.replace(b'<link rel="stylesheet" href="page.css">', b"<style>\n%s</style>" % style)
     body = body.replace(b' src="page.js"></script>', b">%s</script>" % script)
-    headers = (
-        ("Content-Type", "text/html; charset=utf-8"),
-        ("Content-Length", str(len(body))),
-        ("Content-Security-Policy", _policy(script)),
-        ("Cache-Control", "no-store"),
-        ("X-Content-Type-Options", "nosniff"),
-        ("Referrer-Policy", "no-referrer"),  # the address may hold the token
-        ("X-Frame-Options", "DENY"),  # or a stranger's page could make a user press a button unseen
-    )
-    return Page(headers, body)
+    headers = {
+        "Content-Type": "text/html; charset=utf-8",
+        "Content-Length": str(len(body)),
+        "Content-Security-Policy": _policy(script),
+        "Cache-Control": "no-store",
+        "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer",  # the address may hold the token
+        "X-Frame-Options": "DENY",  # or a stranger's page could make a user press a button unseen
+    }
+    return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(headers), body)
 
 
 def _policy(script: bytes) -> str:
@@ -134,7 +127,6 @@ class LiveView:
         self._socket = listen(host, port)
         self._thread: threading.Thread | None = None
         self._viewers: dict[ServerConnection, Viewer] = {}
-        self._watched = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._news = asyncio.Event()
         self._ending = False
@@ -187,7 +179,7 @@ class LiveView:
         self._snapshot.truth_of = truth_of
 
     def _wake_if_watched(self) -> None:
-        if self._watched:
+        if self._viewers:
             self._wake()
 
     def _wake(self) -> None:
@@ -200,7 +192,7 @@ class LiveView:
         try:
             asyncio.run(self._show(first, ready))
         finally:  # also after an unforeseen error, which ends this thread and not the run
-            self._loop, self._watched = None, False
+            self._loop = None
             ready.set()
             if not self._ending:
                 why = f"the live page has ended: {sys.exception()!r}; the run continues"
@@ -247,17 +239,15 @@ class LiveView:
         headers = request.headers
         refusal = self._access.refusal(request.path, headers.get_all("Host"), headers.get_all("Origin"))
         if refusal is not None:
-            return connection.respond(refusal.status, refusal.text + "\n")
-        if request.path.partition("?")[0] == SOCKET:
-            return None
-        return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(self._page.headers), self._page.body)
+            status, why = refusal
+            return connection.respond(status, f"{why}\n")
+        return None if request.path.partition("?")[0] == SOCKET else self._page
 
     async def _attend(self, first: bytes, connection: ServerConnection) -> None:
         if len(self._viewers) >= MOST_VIEWERS:
             await connection.close(CloseCode.TRY_AGAIN_LATER, f"too many viewers ({MOST_VIEWERS}): close one")
             return
         viewer = self._viewers[connection] = Viewer()
-        self._watched = True
         self._looked_at.set()
         broadcast([connection], first)
         self._news.set()
@@ -274,7 +264,6 @@ class LiveView:
             pass
         finally:
             del self._viewers[connection]
-            self._watched = bool(self._viewers)
             pinging.cancel()
             self._news.set()
 

@@ -43,86 +43,73 @@ def open_sources(
     *,
     mountings: Mapping[str, Mounting] = MappingProxyType({}),
 ) -> list[Link]:
-    """Create the links that `texts` name, not yet entered, as `open_source` does.
+    """Create the links that `texts` name, not yet entered; without any, that of the only known adapter.
 
     Each text is one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4", also in `mountings`. Among several
-    sources, those without a name are called by their place, source1 and so on.
+    sources, those without a name are called by their place, source1 and so on. `rate_hz` is that at which recordings
+    are played, among them the demo's; a device has its own. Recordings of edge-sr are in place already.
 
     Raises:
-        SourceError: no such form, or one name twice; and the other errors of `open_source`.
+        SourceError: no such form, or one name twice.
+        NoDeviceError: no adapter, or several without a choice.
+        RecordingError: a recording that cannot be used.
     """
-    named: dict[str, Link] = {}
+    links: dict[str, Link] = {}
     for number, text in enumerate(texts or [None], 1):
         match = None if text is None else re.fullmatch(r"([A-Za-z0-9_-]+)=(.+)", text, re.DOTALL)
         name, form = (match[1], match[2]) if match else (f"source{number}" if len(texts) > 1 else "", text)
         prefix = f"{name}/" if name else ""
-        own = {
-            sensor: mounting
-            for sensor, mounting in mountings.items()
-            if (sensor.startswith(prefix) if prefix else "/" not in sensor)
-        }
-        link = open_source(form, rate_hz, demo_recording, model, own, prefix=prefix)
-        if name in named:
+        link = _link(form, rate_hz, demo_recording, model, mountings, prefix)
+        link.prefix = prefix
+        if name in links:
             raise SourceError(f"two sources are named {name!r}: give each a name of its own, --source NAME=SRC")
-        named[name] = link
-    return list(named.values())
+        links[name] = link
+    return list(links.values())
 
 
-def open_source(
+def _link(
     text: str | None,
-    rate_hz: float | None = None,
-    demo_recording: str | Path | None = None,
-    model: ModelMap = USPA44_MAP,
-    mountings: Mapping[str, Mounting] = MappingProxyType({}),
-    *,
-    prefix: str = "",
+    rate_hz: float | None,
+    demo_recording: str | Path | None,
+    model: ModelMap,
+    mountings: Mapping[str, Mounting],
+    prefix: str,
 ) -> Link:
-    """Create the link that `text`, one of FORMS, names, not yet entered; for None that of the only known adapter.
-
-    `rate_hz` is that at which recordings are played, among them the demo's; a device has its own. `prefix` begins the
-    names of its sensors, and `mountings` are theirs by these names; recordings of edge-sr are in place already.
-
-    Raises:
-        SourceError: no such form.
-        NoDeviceError: no adapter, or several without a choice.
-        RecordingError: a recording that cannot be used.
-    """
+    """Create the link that `text` names; names of its sensors begin with `prefix`."""
     scheme, _, rest = (text or "").partition(":")
     interface, _, channel = rest.partition(":")
     placed = placed_map(model, mountings, prefix)
-    link: Link
     if text is None or scheme == "slcan":
         from firmware_bridge.links.slcan_serial import DEFAULT_BAUD, SlcanSerialLink
 
         port, baud = (find_adapter(serial_ports()).path, None) if text is None else _port_and_baud(text, rest)
         link = SlcanSerialLink(port, baud or DEFAULT_BAUD, model=placed)
         link.name = text or link.name
-    elif scheme == "xela-server" and rest:
+        return link
+    if scheme == "xela-server" and rest:
         from firmware_bridge.links.xela_server import XelaServerLink
 
-        link = XelaServerLink(rest, geometry=placed.geometry, prefix=prefix, mountings=mountings)
-    elif text == "gs_usb" or (scheme == "gs_usb" and rest):
+        return XelaServerLink(rest, geometry=placed.geometry, prefix=prefix, mountings=mountings)
+    if text == "gs_usb" or (scheme == "gs_usb" and rest):
         from firmware_bridge.links.gs_usb_link import GsUsbLink
 
-        link = GsUsbLink(rest or None, model=placed)
-    elif scheme == "can" and channel:
+        return GsUsbLink(rest or None, model=placed)
+    if scheme == "can" and channel:
         from firmware_bridge.links.can_bus import CanBusLink
 
-        link = CanBusLink(interface, channel, model=placed)
-    elif scheme == "replay" and rest:
+        return CanBusLink(interface, channel, model=placed)
+    if scheme == "replay" and rest:
         from firmware_bridge.links.replay import ReplayLink
         from firmware_bridge.recording.formats import load_recording
 
-        link = ReplayLink([_named(load_recording(path), prefix) for path in recording_paths(rest)], rate_hz)
-        place_recordings(link, mountings)
-    elif text in ("demo", DEMO_LOOP) and demo_recording is not None:
+        replay = ReplayLink([_named(load_recording(path), prefix) for path in recording_paths(rest)], rate_hz)
+        place_recordings(replay, mountings)
+        return replay
+    if text in ("demo", DEMO_LOOP) and demo_recording is not None:
         from firmware_bridge.links.demo import DemoLink
 
-        link = DemoLink(demo_recording, rate_hz, loop=text == DEMO_LOOP, model=placed_map(USPA44_MAP, {}, prefix))
-    else:
-        raise _refusal(text)
-    link.prefix = prefix
-    return link
+        return DemoLink(demo_recording, rate_hz, loop=text == DEMO_LOOP, model=placed_map(USPA44_MAP, {}, prefix))
+    raise _refusal(text)
 
 
 def recording_paths(text: str) -> list[str]:

@@ -94,16 +94,16 @@ class Mounting:
         vendor = None if scan.vendor is None else self._place_vendor(scan.vendor)
         return replace(scan, counts=counts, fresh=fresh, renewed=renewed, vendor=vendor)
 
-    def then(self, found: "Mounting") -> "Mounting":
+    def then(self, correction: "Mounting") -> "Mounting":
         """Return this mounting with a correction that was measured on a sensor already mounted by it."""
-        order = np.asarray(self.order)[list(found.order)]
-        swap = [1, 0, 2] if found.swap_xy else [0, 1, 2]
-        signs = [self.signs[axis] * sign for axis, sign in zip(swap, found.signs, strict=True)]
-        gains = np.asarray(self.gains).reshape(len(AXES), -1)[swap][:, list(found.order)]
-        gains *= np.asarray(found.gains).reshape(len(AXES), -1)
+        order = np.asarray(self.order)[list(correction.order)]
+        swap = [1, 0, 2] if correction.swap_xy else [0, 1, 2]
+        signs = [self.signs[axis] * sign for axis, sign in zip(swap, correction.signs, strict=True)]
+        gains = np.asarray(self.gains).reshape(len(AXES), -1)[swap][:, list(correction.order)]
+        gains *= np.asarray(correction.gains).reshape(len(AXES), -1)
         return Mounting(
             tuple(order.tolist()),
-            self.swap_xy != found.swap_xy,
+            self.swap_xy != correction.swap_xy,
             (signs[0], signs[1], signs[2]),
             tuple(gains.ravel().tolist()),
             self.taxel_count,

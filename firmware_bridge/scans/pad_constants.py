@@ -126,18 +126,18 @@ class Pad:
             gain_half_widths=own.gain_half_widths,
         )
 
-    def turned(self, found: Mounting) -> "Pad":
-        """Return the same pad under a mounting that was corrected by `found`: its gains follow the places and axes."""
+    def turned(self, correction: Mounting) -> "Pad":
+        """Return the same pad under a mounting with this correction: its gains follow the places and axes."""
         if self.gains is None:
             return self
         widths = self.gain_half_widths
         return replace(
             self,
-            gains=_turned(self.gains, found),
-            gain_half_widths=None if widths is None else _turned(widths, found),
+            gains=_turned(self.gains, correction),
+            gain_half_widths=None if widths is None else _turned(widths, correction),
         )
 
 
-def _turned(values: tuple[float, ...], found: Mounting) -> tuple[float, ...]:
-    planes = np.asarray(values).reshape(len(AXES), -1)[[1, 0, 2] if found.swap_xy else [0, 1, 2]]
-    return tuple(planes[:, list(found.order)].ravel().tolist())
+def _turned(values: tuple[float, ...], correction: Mounting) -> tuple[float, ...]:
+    planes = np.asarray(values).reshape(len(AXES), -1)[[1, 0, 2] if correction.swap_xy else [0, 1, 2]]
+    return tuple(planes[:, list(correction.order)].ravel().tolist())

@@ -92,7 +92,7 @@ class ScanAssembler:
     @property
     def can_ids(self) -> frozenset[int]:
         """Standard CAN ids received so far, of any device."""
-        return frozenset(one >> 4 for one in self._keys)
+        return frozenset(frame_key >> 4 for frame_key in self._keys)
 
     def feed_frame(self, frame: CanFrame, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
         """Return the scans that a frame closes, whatever it holds; `device` is when it was on the bus, by its stamp."""
@@ -124,8 +124,8 @@ class ScanAssembler:
             if len(numbers) < keys:
                 mine = readings.taken(numbers)
                 times_ns = None if own_ns is None else [own_ns[number] for number in numbers]
-            found = self._sensor(name).feed(mine, taxels, time_ns, times_ns, offset_ns)
-            closed += [(numbers[at], scan) for at, scan in found]
+            scans = self._sensor(name).feed(mine, taxels, time_ns, times_ns, offset_ns)
+            closed += [(numbers[at], scan) for at, scan in scans]
         self._readings += sorted_out
         self.foreign += keys - sorted_out
         if len(runs) > 1:
@@ -136,8 +136,8 @@ class ScanAssembler:
         """Return the numbers and the taxels of each sensor's readings among those with these keys."""
         self._keys.update(keys)
         runs: dict[str, tuple[list[int], list[int]]] = {}
-        for number, one in enumerate(keys):
-            name, taxel = self._places.get(one, ("", 0))
+        for number, frame_key in enumerate(keys):
+            name, taxel = self._places.get(frame_key, ("", 0))
             if name:
                 numbers, taxels = runs.setdefault(name, ([], []))
                 numbers.append(number)
@@ -162,9 +162,9 @@ class ScanAssembler:
         A sensor that a flipped bit created, or that fell silent in mid-scan, is left out: it closes no scan.
         """
         missing = [sensor.missing(self._newest_ns) for sensor in self._sensors.values()]
-        known = [one for one in missing if one is not None]
-        if known:
-            return min(known)
+        counts = [count for count in missing if count is not None]
+        if counts:
+            return min(counts)
         # One as well while the order of a sensor is still to be learnt: no read may sleep through its pauses.
         learnt = all(sensor.wire.order for sensor in self._sensors.values())
         return self._model.geometry.taxel_count if learnt else 1
@@ -306,18 +306,18 @@ class _Sensor:
     def _close(self, *, by_pause: bool) -> list[Scan]:
         taxels, columns = self._taxels, self._columns
         self._taxels, self._columns, self._place = [], ([], [], []), -1
-        known, self._begins_known = self._begins_known, True
+        begins_known, self._begins_known = self._begins_known, True
         count, come = self._taxel_count, len(taxels)
         half = 2 * come >= count
-        if come == count and known:
+        if come == count and begins_known:
             self.wire.close_whole(taxels)
             self.confirmed = self.confirmed or bool(self.wire.order)
-        elif known and not (half or by_pause):
+        elif begins_known and not (half or by_pause):
             self.wire.doubt()
             if self.confirmed:
                 self.counts["resynchronised"] += come
                 return []
-        if not known or not self.wire.order:
+        if not begins_known or not self.wire.order:
             joined = bool(self.wire.order)
             self.counts["resynchronised" if self.confirmed or joined else "unconfirmed"] += come
             return []
@@ -338,7 +338,7 @@ class _Sensor:
         held, self._held = self._held, []
         if not (shows_pauses or on_pace):  # as many frames may be lost as make the parts of two cycles fit
             self.counts["resynchronised"] += count * sum(missing == 0 for *_, missing in held)
-            held = [one for one in held if one[-1]]
+            held = [closed for closed in held if closed[-1]]
         return [self._count(self._series.close(*closed, whole=missing == 0), missing) for *closed, missing in held]
 
     def _counts_of(self, taxels: list[int], columns: Sequence[list[int]]) -> NDArray[np.int32]:

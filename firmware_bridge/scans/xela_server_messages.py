@@ -102,8 +102,8 @@ class ServerDecoder:
         self._counted["without_readings"] += not named
         self._counted["bad_sensor"] += max(0, len(named) - MOST_SENSORS)
         readings = [self._reading(name, content[name]) for name in named[:MOST_SENSORS]]
-        found = tuple(reading for reading in readings if reading is not None)
-        return ServerMessage(sequence, self._time_s(content.get("time")), found)
+        usable = tuple(reading for reading in readings if reading is not None)
+        return ServerMessage(sequence, self._time_s(content.get("time")), usable)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of messages and of their errors.
@@ -144,11 +144,11 @@ class ServerDecoder:
         kelvin = self._in_range(content, self._geometry.taxel_count, (0, KELVIN[1]))
         if kelvin is None or not any(kelvin):  # zeros: the sensor has no thermometer
             return None
-        if min(one for one in kelvin if one) < KELVIN[0]:
+        if min(taxel_k for taxel_k in kelvin if taxel_k) < KELVIN[0]:
             self._counted["bad_values"] += 1
             return None
-        known = np.array([one or math.nan for one in kelvin], dtype=np.float32)
-        return known.reshape(self._geometry.rows, self._geometry.cols)
+        measured = np.array([taxel_k or math.nan for taxel_k in kelvin], dtype=np.float32)
+        return measured.reshape(self._geometry.rows, self._geometry.cols)
 
     def _in_range(self, content: Any, size: int, ends: tuple[float, float]) -> Sequence[float] | None:
         """Return a list of `size` numbers in a range; None, and count it, if it is another thing than None."""

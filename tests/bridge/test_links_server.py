@@ -14,7 +14,7 @@ from xela_server_emulator import VERSIONS, ServerEmulator, VendorServer, looping
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import xela_server
 from firmware_bridge.links.base import LinkReader
-from firmware_bridge.links.registry import open_source
+from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.xela_server import XelaServerLink
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 
@@ -156,7 +156,7 @@ def test_hosts_that_cannot_be_reached(monkeypatch, host, error, words):
     ],
 )
 def test_addresses(url, known):
-    link = open_source(f"xela-server:{url}")
+    (link,) = open_sources([f"xela-server:{url}"])
     assert isinstance(link, XelaServerLink)
     assert (link.name, link.url, link.kind) == (f"xela-server:{url}", known, "device")
 
@@ -169,4 +169,4 @@ def test_addresses(url, known):
 )  # fmt: skip
 def test_addresses_that_are_none(url):
     with pytest.raises(SourceError, match=r"expected ws://HOST or ws://HOST:PORT"):
-        open_source(f"xela-server:{url}")
+        open_sources([f"xela-server:{url}"])

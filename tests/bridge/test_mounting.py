@@ -13,7 +13,7 @@ from xela_server_emulator import message, sensor_entry
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import SourceError
-from firmware_bridge.links.registry import open_source
+from firmware_bridge.links.registry import open_sources
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.scans.can_id_maps import (
     ID_MAPS,
@@ -179,7 +179,7 @@ def test_csv_of_another_pad_than_its_mounting_is_refused(tmp_path, taxels, mount
     (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(taxels)), ",".join(["1000"] * 3 * taxels), ""]))
     mounting = Mounting(tuple(range(mounted))[::-1], taxel_count=mounted)
     with pytest.raises(SourceError, match=rf"4\.csv has {taxels} taxels, .* sensor 4 has {mounted}: leave out"):
-        open_source(f"replay:{tmp_path}/4.csv", 100.0, mountings={"4": mounting})
+        open_sources([f"replay:{tmp_path}/4.csv"], 100.0, mountings={"4": mounting})
 
 
 def test_csv_of_the_vendors_server_alone_is_put_in_place(tmp_path):
@@ -188,7 +188,9 @@ def test_csv_of_the_vendors_server_alone_is_put_in_place(tmp_path):
     write_csv(tmp_path / "4.csv", counts[None])
     write_npz(tmp_path / "4.npz", [0])
     for name, expected in (("4.csv", TURNED.place_counts(counts)), ("4.npz", counts)):
-        with open_source(f"replay:{tmp_path}/{name}", 1000.0, model=ID_MAPS["A"], mountings={"4": TURNED}) as link:
+        texts = [f"replay:{tmp_path}/{name}"]
+        (opened,) = open_sources(texts, 1000.0, model=ID_MAPS["A"], mountings={"4": TURNED})
+        with opened as link:
             assert link.kind == "replay"
             (scan,) = [scan for _ in range(2) if not link.ended for scan in link.read(1.0)]
         assert np.array_equal(scan.counts, expected) and link.counters()["scans"] == 1

@@ -11,7 +11,7 @@ from firmware_bridge.errors import NoDeviceError, SourceError
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
 from firmware_bridge.links.gs_usb_link import GsUsbLink
-from firmware_bridge.links.registry import FORMS, open_source
+from firmware_bridge.links.registry import FORMS, open_sources
 from firmware_bridge.links.serial_ports import PluggedAdapter, Port, find_adapter, find_by_serial, serial_ports
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import ID_MAPS
@@ -114,7 +114,7 @@ def two_vscom(plugged):
     ],
 )
 def test_slcan_sources(two_vscom, text, port, baudrate):
-    link = open_source(text)
+    (link,) = open_sources([text])
     assert isinstance(link, SlcanSerialLink)
     assert (link.port, link.baudrate, link.name, link.kind) == (port, baudrate, text, "device")
 
@@ -129,15 +129,15 @@ def test_slcan_sources(two_vscom, text, port, baudrate):
     ],
 )
 def test_other_sources(text, link, kind):
-    opened = open_source(text, demo_recording="demo.npz")
+    (opened,) = open_sources([text], demo_recording="demo.npz")
     assert isinstance(opened, link) and (opened.name, opened.kind) == (text, kind)
 
 
 def test_no_source_is_the_one_adapter_and_never_a_pretended_one(two_vscom):
     with pytest.raises(NoDeviceError, match="--source demo"):
-        open_source(None, demo_recording="demo.npz")
+        open_sources([], demo_recording="demo.npz")
     two_vscom.remove(SECOND_VSCOM)
-    link = open_source(None)
+    (link,) = open_sources([])
     assert isinstance(link, SlcanSerialLink) and (link.port, link.name) == ("/dev/ttyUSB0", "slcan:/dev/ttyUSB0")
 
 
@@ -148,7 +148,7 @@ def test_no_source_is_the_one_adapter_and_never_a_pretended_one(two_vscom):
 )  # fmt: skip
 def test_texts_that_are_no_source(text):
     with pytest.raises(SourceError) as refused:
-        open_source(text, demo_recording="demo.npz")
+        open_sources([text], demo_recording="demo.npz")
     assert repr(text) in str(refused.value) and all(form in str(refused.value) for form in FORMS)
 
 
@@ -165,21 +165,22 @@ def test_texts_that_are_no_source(text):
 )
 def test_a_source_without_its_form_is_told_what_was_meant(text, meant):
     with pytest.raises(SourceError) as refused:
-        open_source(text)
+        open_sources([text])
     assert str(refused.value) == f"source is {text!r}: did you mean {meant}?"
 
 
 @pytest.mark.parametrize("baud", ["", "fast", "0", "-1", "²", "0115200", "99999999999", "9" * 5000])
 def test_a_baud_that_is_none_is_refused(baud):
     with pytest.raises(SourceError, match=rf"^baud is '{baud[:20]}', expected .*slcan:/dev/ttyUSB0@115200$") as refused:
-        open_source(f"slcan:/dev/ttyUSB0@{baud}")
+        open_sources([f"slcan:/dev/ttyUSB0@{baud}"])
     assert len(str(refused.value)) < 120
 
 
 def test_replay_sources(tmp_path):
     first, second, comma = (write_recording(tmp_path / f"{name}.csv", make_counts(2)) for name in ("a", "b", "a,b"))
     for text, sensors in ((f"{first},{second}", {"a", "b"}), (str(comma), {"a,b"})):
-        with open_source(f"replay:{text}", 1000.0) as link:
+        (opened,) = open_sources([f"replay:{text}"], 1000.0)
+        with opened as link:
             assert {scan.sensor for _ in range(2) for scan in link.read(1.0)} == sensors
 
 
@@ -187,7 +188,8 @@ def test_replay_sources(tmp_path):
 def test_the_id_map_is_the_one_asked_for(tmp_path, model):
     rig, (sensor, *_) = SlcanRig(tmp_path, None), sorted({sensor for sensor, _ in ID_MAPS[model].taxels.values()})
     frames = [CanFrame(can_id, bytes(8)) for can_id, _ in ID_MAPS[model].wire_order(sensor)]
-    with open_source(rig.name, model=ID_MAPS[model]) as link:
+    (opened,) = open_sources([rig.name], model=ID_MAPS[model])
+    with opened as link:
         assert [(scan.sensor, scan.complete) for scan in rig.read(link, frames)] == [(sensor, True)]
     rig.close()
 

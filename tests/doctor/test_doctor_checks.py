@@ -8,8 +8,8 @@ import pytest
 from doctor_samples import COUNTERS, REST, as_scans, healthy_counts, silenced, times_ns, watched
 from edge_samples import ROOT, FakeLink, make_scan
 
-from edge.doctor.examine import Watched, judge, watch
-from edge.doctor.link_checks import LineFacts, check_baud, check_id_map, check_latency, check_link
+from edge.doctor.examine import judge, watch
+from edge.doctor.link_checks import Watched, check_baud, check_id_map, check_latency, check_link
 from edge.doctor.taxel_checks import Samples
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import LinkLostError
@@ -190,9 +190,9 @@ class TestLine:
         ],
     )
     def test_counters(self, counters, verdict, words):
-        finding = check_link(counters, 4.0)
+        finding = check_link(Watched(counters=counters, duration_s=4.0))
         assert finding is not None and finding.verdict == verdict and words in finding.remedy
-        assert check_link({"scans": 5}, 1.0) is None
+        assert check_link(Watched(counters={"scans": 5}, duration_s=1.0)) is None
 
     @pytest.mark.parametrize(
         ("baud", "rate_hz", "verdict"),
@@ -206,21 +206,20 @@ class TestLine:
     )
     def test_baud(self, baud, rate_hz, verdict):
         counters = {"received_bytes": 22 * 16 * rate_hz * 4, "frames": 16 * rate_hz * 4}
-        finding = check_baud(LineFacts("/dev/ttyUSB0", baud), counters, 4.0, 1, None)
+        finding = check_baud(Watched(counters=counters, duration_s=4.0, port="/dev/ttyUSB0", baud=baud), 1)
         assert finding is not None and finding.verdict == verdict
 
     def test_a_full_line_is_the_only_thing_wrong(self):
         rate_hz = 115_200 / 10 / (22 * 16)
         counters = {"received_bytes": 115_200 // 10 * 4, "frames": int(115_200 / 220 * 4)}
         scans = as_scans(healthy_counts(), times_ns(rate_hz=rate_hz))
-        facts = LineFacts("/dev/ttyUSB0", 115_200, 1)
-        assert faults(scans, counters=counters, facts=facts) == FULL
+        assert faults(scans, counters=counters, port="/dev/ttyUSB0", baud=115_200, latency_ms=1) == FULL
 
     def test_latency_by_the_timer(self):
-        held = check_latency(LineFacts("/dev/ttyUSB0", 3_000_000, 16))
+        held = check_latency(Watched(port="/dev/ttyUSB0", latency_ms=16))
         assert held.verdict == "wrong" and "ttyUSB0/latency_timer" in held.remedy
-        assert check_latency(LineFacts("/dev/ttyUSB0", 3_000_000, 1)).verdict == "ok"
-        assert check_latency(LineFacts("/dev/ttyACM0", 3_000_000)) is None
+        assert check_latency(Watched(port="/dev/ttyUSB0", latency_ms=1)).verdict == "ok"
+        assert check_latency(Watched(port="/dev/ttyACM0")) is None
 
 
 def ids_of(model, sensor):
@@ -268,9 +267,9 @@ class TestIdMap:
         ],
     )
     def test_a_sensor_with_a_fault_is_not_talked_into_another_map(self, ids, model, half_silent, verdict, words):
-        finding = check_id_map(frozenset(ids), model, half_silent)
+        finding = check_id_map(Watched(ids=frozenset(ids), model=model), half_silent)
         assert finding is not None and finding.verdict == verdict and words in finding.measured
-        assert check_id_map(frozenset(), model, half_silent) is None, "a link without ids says nothing of maps"
+        assert check_id_map(Watched(model=model), half_silent) is None, "a link without ids says nothing of maps"
 
 
 def test_each_finding_has_a_row():

@@ -26,7 +26,7 @@ from edge.errors import EdgeError, ModelError
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import check_plain
 from edge.inference.onnx_session import ModelSession
-from edge.pipeline.commands import CommandLines, Commands
+from edge.pipeline.commands import Commands, command_lines
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
@@ -141,16 +141,13 @@ def commands(data: bytes) -> None:
     os.write(write_end, data)
     os.close(write_end)
     asked = Commands()
-    lines = CommandLines(asked, read_end)
-    try:
+    with command_lines(asked, read_end):
         wait_for(lambda: "command-lines" not in [thread.name for thread in threading.enumerate()])
         got = asked.poll()
         assert all(command.name in ("reset", "zero") and isinstance(command.force, bool) for command in got)
         assert len(got) + asked.refused <= data.count(b"\n") + 1
         assert len(got) <= data.count(b"reset") + data.count(b"zero") + data.count(b"\\u")
-    finally:
-        lines.close()
-        os.close(read_end)
+    os.close(read_end)
 
 
 def contract(data: bytes) -> None:

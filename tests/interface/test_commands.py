@@ -16,15 +16,15 @@ import pytest
 from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, wait_for, write_model
 
-from edge.pipeline.commands import RESET, Command, CommandLines, Commands, read_stdin, user_commands
+from edge.pipeline.commands import RESET, Command, Commands, command_lines, read_stdin, user_commands
 from firmware_bridge.zeroing.baseline import save_baselines
 
-OPEN = []
+OPEN = contextlib.ExitStack()
 
 
 def lines_of(descriptor):
     commands = Commands()
-    OPEN.append(CommandLines(commands, descriptor))
+    OPEN.enter_context(command_lines(commands, descriptor))
     return commands
 
 
@@ -45,8 +45,7 @@ def polled_stdin():
 def pipe():
     ends = list(os.pipe())
     yield ends
-    while OPEN:
-        OPEN.pop().close()
+    OPEN.close()
     for end in ends:
         with contextlib.suppress(OSError):
             os.close(end)

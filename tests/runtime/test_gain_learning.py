@@ -151,8 +151,8 @@ class TestLearner:
 
 def learning_of(measured, used=None, check=None):
     """Return the stage of a sensor that learns, the pad in use, and the events that it reports."""
-    pad, events = SensorPad(make_pad_contract(), used or measured, None, check), []
-    return Learn(MODEL, measured, pad, lambda kind, detail="": events.append((kind, detail))), pad, events
+    pad, events = SensorPad(make_pad_contract(), None, used or measured, None), []
+    return Learn(MODEL, measured, pad, check, lambda kind, detail="": events.append((kind, detail))), pad, events
 
 
 def held(learn, contact, trusted=None):
@@ -252,8 +252,7 @@ class TestKeeping:
         for number in range(12):
             keepers[number % 2].keep(str(number), LEARNED)
         for keeper in keepers:
-            keeper.close()
-            assert keeper.trouble is None
+            assert keeper.close() is None
         known = load_sensor_file(file)
         assert known.pads == {str(number): LEARNED for number in range(12)}
         assert known.adapter == "D30BL366" and known.baselines["4"].id == BASELINE.id

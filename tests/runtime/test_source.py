@@ -16,7 +16,7 @@ from edge.pipeline.cadence import ReadingPace
 from edge.pipeline.scan_reader import CAPACITY_SCANS
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.base import Notice
-from firmware_bridge.links.registry import open_source
+from firmware_bridge.links.registry import open_sources
 from firmware_bridge.recording.tracks import Recording, Track
 
 LIMIT_S = 30
@@ -145,8 +145,7 @@ def test_what_is_read_does_not_depend_on_when(pace):
     played = recording(100, 60)
     with ExitStack() as closing:
         emulators = [closing.enter_context(Emulator([played], waits=True)) for _ in range(2)]
-        named = enumerate(emulators)
-        links = [open_source(f"slcan:{emulator.port}", prefix=f"f{index}/") for index, emulator in named]
+        links = open_sources([f"f{index}=slcan:{emulator.port}" for index, emulator in enumerate(emulators)])
         source = Source(*links, give_up_s=float("inf"))
         closing.enter_context(source)
         source.pace = pace

@@ -12,15 +12,25 @@ from edge.api import Pad
 from edge.inference.contract import ANY_BATCH, scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.trust_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, TrustVerdict, foreign_taps
+from edge.perception.trust_check import (
+    LEAST_COUNTS,
+    MOST_MISMATCH,
+    REPEATS,
+    PatternCheck,
+    SensorPad,
+    TrustVerdict,
+    foreign_taps,
+)
+from firmware_bridge.scans.pad_constants import GAINS
 
 CONTRACT = make_trusted_contract()
 PAD_ROW = CONTRACT.pad_row(None)
 _CONTACTS = 60
 
 
-def make_check(contract=CONTRACT) -> PatternCheck:
-    return PatternCheck(make_trust(), contract)
+def make_check(contract=CONTRACT, pad=None) -> PatternCheck:
+    trust = make_trust()
+    return PatternCheck(trust, contract, SensorPad(contract, trust, pad, None))
 
 
 def make_tap(z=2.0, x=0.0):
@@ -114,8 +124,8 @@ class TestReasons:
     def test_gains_that_are_certain_leave_less_unexplained(self):
         tap = make_tap()
         tap[2, 1, 1] *= 1.2
-        certain, unsure = make_check(), make_check()
-        certain.use_pad(np.append(PAD_ROW[:-1], np.float32(1)))
+        exact = Pad(gains=(1.0,) * GAINS, gain_half_widths=(0.0,) * GAINS)
+        certain, unsure = make_check(pad=exact), make_check()
         pattern = np.kron(make_tap()[2], np.ones((10, 10), dtype=np.float32))
         traction = np.zeros((3, 8, 8), dtype=np.float32)
         more, less = (check.judge(0, tap, pattern, None, traction, 0).mismatch for check in (certain, unsure))

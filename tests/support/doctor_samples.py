@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 
-from edge.doctor.examine import Watched
 from edge.doctor.guided_press import CORNERS
+from edge.doctor.link_checks import Watched
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries

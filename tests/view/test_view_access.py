@@ -19,7 +19,7 @@ def asks(access, path="/", host=OURS, origin=None):
     """Status of the refusal, or None."""
     hosts = [host] if isinstance(host, str) else host
     refusal = access.refusal(path, hosts, [] if origin is None else [origin])
-    return None if refusal is None else refusal.status.value
+    return None if refusal is None else refusal[0].value
 
 
 # Names of the machine at each address that it listens at, and names that a stranger decides what they point to.

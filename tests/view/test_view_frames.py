@@ -124,7 +124,7 @@ def test_memory_does_not_grow_with_the_run(heard):
     for number in range(20_000):
         scan = replace(idle.scan, number=number, time_ns=number * PERIOD_NS)
         heard.write(replace(idle, scan=scan, events=(AGAIN,)), {})
-    assert len(heard.points("4", 0)) <= TRACE_POINTS and len(heard.events(0)) == EVENTS
+    assert len(heard.sensors["4"].points(0)) <= TRACE_POINTS and len(heard.events(0)) == EVENTS
 
 
 def test_events_come_once_and_a_newcomer_gets_the_latest(heard, clock):

@@ -1,6 +1,6 @@
 """Networks by name, each with its width.
 
-The bundled models are these, at scale 10:
+The bundled models are these, at scale 10; `edge/inference/bundled.py` names the default:
 
 | model | network | channels | residual blocks |
 |---|---|---|---|

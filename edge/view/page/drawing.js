@@ -22,24 +22,24 @@ function colourTable(name) {
   return table;
 }
 
-const VIRIDIS = colourTable("viridis");
-const CIVIDIS = colourTable("cividis");
-const MAGMA = colourTable("magma");
+const PATTERN_COLOURS = colourTable("viridis");
+const TAXEL_COLOURS = colourTable("cividis");
+const DEVIATION_COLOURS = colourTable("magma");
 
 const level = (value, high) => Math.max(0, Math.min(LEVELS - 1, Math.round((value / high) * (LEVELS - 1))));
 
-/** Paint one canvas pixel for each value of a map, which the style sheet enlarges; null clears the canvas. */
-function paintMap(canvas, map, high, table) {
+/** Paint one canvas pixel for each value of a map, which the style sheet enlarges; NaN is transparent, values below 0 have the colour `below`, if any, and null clears the canvas. */
+function paintMap(canvas, map, high, table, below = null) {
   const context = canvas.getContext("2d");
   if (map === null) return context.clearRect(0, 0, canvas.width, canvas.height);
   const [rows, cols] = map.shape;
   if (canvas.width !== cols || canvas.height !== rows) [canvas.width, canvas.height] = [cols, rows];
   const image = context.createImageData(cols, rows);
-  for (let pixel = 0; pixel < rows * cols; pixel++) {
-    const at = 3 * level(map.values[pixel], high);
-    for (let channel = 0; channel < 3; channel++) image.data[4 * pixel + channel] = table[at + channel];
-    image.data[4 * pixel + 3] = 255;
-  }
+  map.values.forEach((value, pixel) => {
+    const at = 3 * level(value, high);
+    for (let channel = 0; channel < 3; channel++) image.data[4 * pixel + channel] = value < 0 && below ? below[channel] : table[at + channel];
+    image.data[4 * pixel + 3] = Number.isNaN(value) ? 0 : 255;
+  });
   return context.putImageData(image, 0, 0);
 }
 

@@ -85,7 +85,7 @@ const hand = {
     pad.querySelector(".link").dataset.up = sensor.comes() ? "yes" : "no";
     const doubt = sensor.doubted() ? `; ${sensor.verdict()}` : "";
     pad.setAttribute("aria-label", `sensor ${sensor.name}: ${word}${doubt}`);
-    paintMap(pad.querySelector("canvas"), sensor.pattern, Math.max(...[...page.sensors.values()].map((one) => one.high())), VIRIDIS);
+    paintMap(pad.querySelector("canvas"), sensor.pattern, Math.max(...[...page.sensors.values()].map((one) => one.high())), PATTERN_COLOURS);
   },
 };
 

@@ -17,8 +17,8 @@ class MapPane {
     this.shown = this.header;
     if (this.header === null) return;
     const { counts } = this.header;
-    this.paintContact(byId("map-contact"));
-    paintBar(byId("map-bar"), VIRIDIS);
+    paintMap(byId("map-contact"), this.contact, 1, PATTERN_COLOURS, [200, 40, 30]); // not believed: red
+    paintBar(byId("map-bar"), PATTERN_COLOURS);
     const fates = { doubted: "not believed", light: "too light", outside: "outside the map", without_pose: "without a pose", together: "of two pads at one place" };
     const left = Object.entries(fates).filter(([key]) => counts[key] > 0).map(([key, why]) => `${counts[key]} ${why}`);
     const mark = page.hello?.source === "emulated" ? "EMULATED: " : "";
@@ -26,19 +26,6 @@ class MapPane {
     show(byId("map-empty"), counts.fused === 0);
     say(byId("map-empty"), counts.without_pose > 0 ? "no poses come: send those of the pad" : "nothing touched yet");
     this.paintPads();
-  }
-
-  paintContact(canvas) {
-    const [count] = this.contact.shape;
-    if (canvas.width !== count) [canvas.width, canvas.height] = [count, count];
-    const context = canvas.getContext("2d");
-    const image = context.createImageData(count, count);
-    this.contact.values.forEach((value, pixel) => {
-      if (Number.isNaN(value)) return; // nothing came there: transparent
-      const at = 3 * level(value, 1);
-      image.data.set(value < 0 ? [200, 40, 30, 255] : [VIRIDIS[at], VIRIDIS[at + 1], VIRIDIS[at + 2], 255], 4 * pixel);
-    });
-    context.putImageData(image, 0, 0);
   }
 
   /** Draw the outline of each pad where it was when the map was painted, with a mark at the end of its x axis. */

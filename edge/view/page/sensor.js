@@ -17,9 +17,9 @@ class Sensor {
     this.fields = this.addNumbers();
     this.sized = [this.part.over, this.part.shear, this.part["force-plot"], this.part["area-plot"]];
     for (const canvas of this.sized) sizes.observe(canvas);
-    paintBar(this.part["pattern-bar"], VIRIDIS);
-    paintBar(this.part["taxels-bar"], CIVIDIS);
-    paintBar(this.part["deviation-bar"], MAGMA);
+    paintBar(this.part["pattern-bar"], PATTERN_COLOURS);
+    paintBar(this.part["taxels-bar"], TAXEL_COLOURS);
+    paintBar(this.part["deviation-bar"], DEVIATION_COLOURS);
     this.listen();
   }
 
@@ -247,7 +247,7 @@ class Sensor {
     say(stamp, this.stampText());
     show(stamp, this.unsure() || !live);
     say(this.part["pattern-high"], `${number(high, high < 0.1 ? 3 : 2)}${THIN}${unit}, ${page.auto ? "largest so far" : "full scale"}`);
-    paintMap(pattern, this.pattern, high, VIRIDIS);
+    paintMap(pattern, this.pattern, high, PATTERN_COLOURS);
     const most = this.pattern !== null && live ? largest(this.pattern.values) : null;
     say(this.part["pattern-most"], most === null ? "" : `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}`);
     this.paintTruth(high);
@@ -264,7 +264,7 @@ class Sensor {
     const known = this.pattern !== null && this.truth !== null;
     show(this.part["truth-shown"], known);
     if (!known) return;
-    paintMap(this.part.truth, this.truth, high, VIRIDIS);
+    paintMap(this.part.truth, this.truth, high, PATTERN_COLOURS);
     const squares = this.pattern.values.reduce((sum, value, at) => sum + (value - this.truth.values[at]) ** 2, 0);
     say(this.part["truth-error"], amount((100 * Math.sqrt(squares / this.pattern.values.length)) / (page.hello.full_scale || 1), 1, "%"));
   }
@@ -292,7 +292,7 @@ class Sensor {
       const z = values.subarray(2 * count, 3 * count);
       const believed = Array.from(z, (value, taxel) => (this.result.dead?.[taxel] ? 0 : value));
       const high = roundUp(largest(believed, LEAST_COUNTS));
-      paintMap(taxels, { values: z, shape: [rows, cols] }, high, CIVIDIS);
+      paintMap(taxels, { values: z, shape: [rows, cols] }, high, TAXEL_COLOURS);
       say(this.part["taxels-high"], `${short(high)}${THIN}counts`);
       if (width > 0) paintShear(this, context, width, height, rows, cols, values, high);
     }
@@ -307,7 +307,7 @@ class Sensor {
     show(stamp, this.deviation === null);
     say(stamp, this.pattern !== null ? "not given by this model" : "no contact yet");
     const high = this.deviation === null ? null : roundUp(largest(this.deviation.values, 0.01));
-    paintMap(deviation, this.deviation, high, MAGMA);
+    paintMap(deviation, this.deviation, high, DEVIATION_COLOURS);
     say(this.part["deviation-high"], high === null ? this.unit() : `${short(high)}${THIN}${this.unit()}`);
   }
 
@@ -321,7 +321,7 @@ class Sensor {
     [...thumbs.children].forEach((item, tap) => {
       item.classList.toggle("empty", tap >= there);
       const map = tap < there ? { values: this.taps.values.subarray(tap * rows * cols, (tap + 1) * rows * cols), shape: [rows, cols] } : null;
-      paintMap(item.firstChild, map, high, CIVIDIS);
+      paintMap(item.firstChild, map, high, TAXEL_COLOURS);
     });
   }
 
