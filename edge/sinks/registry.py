@@ -1,5 +1,6 @@
 """Registry of the sinks, by the names that a user writes, and the fan-out of a run's results to all of them."""
 
+import os
 import sys
 import threading
 import time
@@ -141,9 +142,13 @@ def check_sink(text: str) -> tuple[str, str]:
 
 def check_apart(texts: Sequence[str]) -> None:
     """Raise a UsageError where a sink is there twice: both would write to the same place."""
+    places: dict[tuple[str, str], str] = {}
     for text in texts:
-        if texts.count(text) > 1:
-            raise UsageError(f"sink {text!r} is there {texts.count(text)} times: leave one")
+        name, _, target = text.partition(":")
+        place = name, os.path.realpath(target)
+        if place in places:
+            raise UsageError(f"sinks {places[place]!r} and {text!r} write to the same place: leave one out")
+        places[place] = text
 
 
 def open_sink(
