@@ -78,6 +78,7 @@ class Recording:
             None if the file does not state it.
         poses: poses of the pads, in the order in which they were taken.
         poses_by_row: the times of the poses are rows of the scans, which have no times themselves.
+        pauses: (n,) time without a scan before each scan, in periods, of scans without times; None without any.
     """
 
     path: Path
@@ -90,6 +91,7 @@ class Recording:
     origin: Literal["device", "emulated"] | None = None
     poses: Sequence[TimedPose] = ()
     poses_by_row: bool = False
+    pauses: NDArray[np.float64] | None = None
 
 
 def origin_of(kinds: Iterable[str | None]) -> Literal["device", "emulated"] | None:
