@@ -199,7 +199,7 @@ class TestRecord:
         assert f"recording into {path} stopped: File too large; its " in said.splitlines()[-1]
 
     @pytest.mark.parametrize("room_bytes", [0, 100, 4000])
-    def test_of_a_disk_without_room_for_a_scan_no_file_is_left_that_cannot_be_played(self, made, tmp_path, room_bytes):
+    def test_a_disk_without_room_for_one_scan_leaves_no_file(self, made, tmp_path, room_bytes):
         path, disk = tmp_path / "full.mcap", partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room_bytes,) * 2)
         process = start("record", path, *source_of(made, 60), preexec_fn=disk)
         _, said = process.communicate()

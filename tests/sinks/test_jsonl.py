@@ -38,7 +38,7 @@ class TestJsonLines:
             assert path.read_bytes() == expected, "there as soon as it is written"
         sink.close()
 
-    def test_a_run_that_does_not_begin_leaves_the_records_of_the_one_before(self, tmp_path):
+    def test_a_run_that_does_not_begin_leaves_the_old_records(self, tmp_path):
         """As of `edge-sr --sink jsonl:out.jsonl --sink mcap:FILE` where FILE exists."""
         path = tmp_path / "out.jsonl"
         path.write_text('{"time_ns":5,"sensor":"old"}\n')
