@@ -20,7 +20,7 @@ from edge.perception.taxel_health import load_estimator
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped
-from edge.validation import check_positive, check_whole
+from edge.validation import check_kind, check_positive, check_whole
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44, pad_of
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track
 from firmware_bridge.scans.pad_constants import GAINS, Pad
@@ -78,6 +78,8 @@ def open_runtime(
             the model takes.
     """
     chosen = RuntimeOptions(**options)
+    if not isinstance(model, (str, Path)):
+        check_kind("model", model, "run_together", "the name of one, its file, or what load_model returned")
     if not isinstance(source, Source):
         raise UsageError(f"source is {source!r}, expected an open one: with open_source(...) as source")
     sensor_file, nominal = source.sensor_file, source.sensor_file.geometry == USPA44

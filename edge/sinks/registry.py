@@ -16,6 +16,7 @@ from edge.perception.result import Result
 from edge.pipeline.commands import Commands
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
+from edge.validation import check_kind
 from firmware_bridge.errors import as_typed, how_to_install
 from firmware_bridge.poses import TimedPose
 
@@ -128,6 +129,7 @@ class Form(NamedTuple):
 
 def check_sink(text: str) -> tuple[str, str]:
     """Return name and target of the sink that `text` names, or raise a UsageError; nothing is opened."""
+    check_kind("sink", text, "partition", "text, as after --sink")
     name, _, target = text.partition(":")
     form = FORMS.get(name)
     if name == "npz" and target:
@@ -176,6 +178,8 @@ def open_sink(
         SinkError: it cannot be opened.
     """
     name, target = check_sink(text)
+    check_kind("contract", contract, "output_unit", "that of the model, as load_model(...).contract")
+    check_kind("source", source, "sensor_file", "an open one: with open_source(...) as source")
     if name in ("mcap", "ros2", "rerun") and contract.output_unit != "mm":
         raise UsageError(f"{text}: the model's patterns are in {contract.output_unit!r}, expected mm: use another sink")
     # Each is imported only where it is used, which saves start-up time and memory.
