@@ -304,7 +304,7 @@ def test_files_that_cannot_be_read(tmp_path):
     for name, content, words in (
         ("gone.csv", None, r"gone\.csv: cannot be read: No such file"),
         ("gone.npz", None, r"gone\.npz: cannot be read: No such file"),
-        ("folder.csv", None, r"folder\.csv is a folder: name a recording in it, .*: which holds no \.mcap"),
+        ("folder.csv", None, r"folder\.csv is a folder, expected a recording: it holds no \.mcap"),
         ("finger.txt", b"", r"ends in \.csv, \.npz or \.mcap"),
         ("finger.csv", HEADER.encode(), r"finger\.csv, .*expected a row of counts"),
         ("finger.npz", b"", "finger"),
