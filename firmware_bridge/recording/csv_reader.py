@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from firmware_bridge.errors import RecordingError, harmless
 from firmware_bridge.pad_geometry import AXES, PADS, USPA44, SensorGeometry
 from firmware_bridge.poses import PadPose, TimedPose
-from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, is_rate
+from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, check_raw, is_rate
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
 
@@ -227,6 +227,7 @@ class _Scans:
             sound = np.abs(newtons).max(axis=(1, 2, 3)) <= HIGHEST_NEWTONS  # False of NaN
             vendor = tuple(VendorReading(force) if right else None for force, right in zip(newtons, sound, strict=True))
         counts = _by_axis(np.frombuffer(self._counts, np.int32), self._pad)
+        check_raw(path, counts)
         return Recording(
             path,
             (Track(harmless(path.stem, kept=""), counts, time_ns=None, vendor=vendor),),

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import can
@@ -12,7 +13,7 @@ from can.interfaces.slcan import slcanBus
 from edge_samples import FakeModel, make_scan
 from mcap_samples import SURE
 
-from edge.api import Event, Stream, open_recording, open_runtime
+from edge.api import Event, Stream, infer, open_recording, open_runtime
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import FRAME_S, Controller, Emulator, SlcanAdapter, bus_timeline
 from firmware_bridge.errors import DeviceError, RecordingError, SourceError
@@ -172,6 +173,22 @@ def test_no_tap_goes_on_over_a_gap_in_the_times_of_a_csv(tmp_path, rate_hz, goin
     assert f"before scan 151 there is a gap of {noted}" in events[0].text
     assert [made[n].taps_used for n in (149, 150)] == [2, 1], "as live, after an outage"
     assert made[150].scan.time_ns - made[149].scan.time_ns > 2_900_000_000
+
+
+@pytest.mark.parametrize(
+    ("cut_off", "words"), [(False, None), (True, "0 on one axis and not on another, as readings over")]
+)
+def test_readings_over_a_baseline_cut_off_at_0_are_no_counts(tmp_path, cut_off, words):
+    """Their patterns look right; a broken chip, whose counts are 0 on all axes, is another thing."""
+    counts = np.stack([make_scan(n, press_counts=3000 * (n > 90), noise=3).counts for n in range(150)])
+    counts[:, :, 0, :3] = 0
+    if cut_off:
+        counts = np.maximum(counts - counts[:9].mean(axis=0), 0).astype(int)
+    path = write_recording(tmp_path / "finger.csv", counts)
+    with nullcontext() if words is None else pytest.raises(RecordingError, match=rf"finger\.csv: .*{words}"):
+        open_recording(path, rate_hz=100)
+    with nullcontext() if words is None else pytest.raises(RecordingError, match=rf"counts: .*{words}"):
+        infer(FakeModel(), counts, counts[:9])
 
 
 # The demo: its emulator plays through, and has hung up however the demo ends.
