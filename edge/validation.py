@@ -22,6 +22,12 @@ def as_float(value: Any) -> float | None:
         return None
 
 
+def check_kind(name: str, value: Any, attribute: str, expected: str) -> None:
+    """Check that an argument called `name` is of its kind, by an attribute that all of the kind have."""
+    if not hasattr(value, attribute):
+        raise UsageError(f"{name} is {value!r:.60}, expected {expected}")
+
+
 def check_positive(name: str, number: Any, low: float = POSITIVE[0], high: float = POSITIVE[1]) -> None:
     """Check that the value called `name` is a positive number in a range."""
     value = as_float(number)

@@ -92,7 +92,7 @@ class DemoScenes:
         """Announce the outcome of the scene, and count from 0."""
         if self._scene == FOREIGN:
             none = "no tap was dropped: this model takes one tap, or has not noticed the other surface"
-            self._say(f"earlier taps were dropped {self._dropped} times" if self._dropped else none)
+            self._say(f"times that earlier taps were dropped: {self._dropped}" if self._dropped else none)
         elif self._scene == MAGNET:
             doubted = f"{self._untrusted} of {self._patterns} patterns with the magnet were not to be believed"
             none = f"none of {self._patterns} patterns with the magnet was checked"

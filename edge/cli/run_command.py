@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -165,8 +165,6 @@ def map_object(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     for path, ending in ((options.out, ".npz"), (options.png, ".png")):
         if path is not None and path.suffix != ending:
             raise UsageError(f"{path} is no name of a map's file: expected one that ends in {ending}")
-    if not all(map(isfinite, options.centre_mm)):
-        raise UsageError(f"--centre-mm {options.centre_mm[0]} {options.centre_mm[1]}: expected two finite numbers")
     whole = ObjectMap(options.size_mm, options.px_per_mm, centre_mm=tuple(options.centre_mm))
     sink = MapSink(whole, npz=options.out, png=options.png)
     try:

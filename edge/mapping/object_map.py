@@ -8,7 +8,7 @@ with what lies on the map already where both touched.
 
 from collections import deque
 from dataclasses import dataclass
-from math import cos, inf, radians, sin
+from math import cos, inf, isfinite, radians, sin
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -176,7 +176,7 @@ class ObjectMap:
     """Map of one object, a square of `size_mm` around `centre_mm` in the object's plane.
 
     A pixel of a pattern counts as touched from the share `contact_level` of its top on: a blurred edge of a flat part
-    truly lies at a half. Raises a UsageError where the size is out of range.
+    truly lies at a half. Raises a UsageError where the size or the centre is out of range.
     """
 
     def __init__(
@@ -192,6 +192,8 @@ class ObjectMap:
             raise UsageError(
                 f"a map of {size_mm:g} mm at {px_per_mm:g} px/mm, expected 1 to {MOST_PX} pixels along a side"
             )
+        if len(centre_mm) != 2 or not all(map(isfinite, centre_mm)):
+            raise UsageError(f"the centre of a map is {centre_mm}, expected two finite numbers")
         self.grid = Grid(count, px_per_mm, centre_mm)
         self.counts = {"fused": 0, "doubted": 0, "light": 0, "outside": 0}
         """Patterns by their fate; those of presses too light to tell from drift are left out."""

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from edge.errors import UsageError
 from edge.pipeline.pose_queue import LONGEST_BYTES, PoseQueue, json_object
 from edge.terminal.stop_signals import handled
+from edge.validation import check_kind
 from firmware_bridge.scans.scan import is_sensor_name
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ class Commands:
 
     def put(self, command: Command) -> None:
         """Put a command into the queue; a handler of signals may call it, too, also while another is put."""
+        check_kind("command", command, "carry_out", 'a Command, such as Command("zero")')
         self._waiting.put(command)
 
     def refuse(self, reason: str | None = None) -> None:

@@ -18,7 +18,7 @@ from edge.pipeline.pose_queue import PoseIntake
 from edge.pipeline.run_statistics import Statistics, counts_of
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.validation import check_positive
+from edge.validation import check_kind, check_positive
 from firmware_bridge.errors import BridgeError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.poses import TimedPose
@@ -73,6 +73,11 @@ class Loop:
         Raises:
             UsageError: the duration is out of range, or the source has another stream.
         """
+        check_kind("source", source, "patient", "an open one: with open_source(...) as source")
+        check_kind("runtime", runtime, "unposed", "what open_runtime returned")
+        check_kind("sinks", sinks, "__iter__", "a list of sinks")
+        for sink in sinks:
+            check_kind("sink", sink, "uses_poses", "what open_sink returned, or a class that inherits Sink")
         if duration_s is not None:
             check_positive("duration_s", duration_s)
         self.statistics = Statistics() if statistics is None else statistics

@@ -10,7 +10,7 @@ from typing import Any, Final
 from edge.inference.bundled import POSED_MODEL
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
-from edge.validation import as_float
+from edge.validation import as_float, check_kind
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose, TimedPose
 from firmware_bridge.scans.scan import is_sensor_name
 from firmware_bridge.schedule import SENSOR_SILENT_NS
@@ -107,6 +107,7 @@ class PoseQueue:
 
     def put(self, pose: TimedPose) -> None:
         """Put a pose; if too many wait, the oldest is dropped."""
+        check_kind("pose", pose, "used_from_ns", "a TimedPose")
         with self._lock:
             if len(self._waiting) >= WAITING_POSES:
                 self._waiting.popleft()

@@ -20,9 +20,9 @@ from edge.perception.taxel_health import load_estimator
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped
-from edge.validation import check_positive, check_whole
+from edge.validation import check_kind, check_positive, check_whole
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44, pad_of
-from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track
+from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track, check_raw
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.sensor_file.model import SensorEntry
@@ -78,6 +78,8 @@ def open_runtime(
             the model takes.
     """
     chosen = RuntimeOptions(**options)
+    if not isinstance(model, (str, Path)):
+        check_kind("model", model, "run_together", "the name of one, its file, or what load_model returned")
     if not isinstance(source, Source):
         raise UsageError(f"source is {source!r}, expected an open one: with open_source(...) as source")
     sensor_file, nominal = source.sensor_file, source.sensor_file.geometry == USPA44
@@ -114,6 +116,7 @@ def infer(
     Raises:
         UsageError: counts are not whole; an array is of another shape, or out of range; the rate is.
         ModelError: as in `open_runtime`.
+        RecordingError: counts are readings over a baseline, cut off at 0.
     """
     from firmware_bridge.links.replay import ReplayLink
 
@@ -122,6 +125,7 @@ def infer(
     scans = np.ascontiguousarray(readings, dtype=np.int32)
     if (scans != readings).any():
         raise UsageError("counts are not whole numbers, expected raw counts: no means, and nothing subtracted")
+    check_raw("counts", scans)
     if not isinstance(baseline, Baseline):
         baseline = Baseline.from_counts("array", _checked("counts of the baseline", baseline, lowest=0), 0.0)
     recording = Recording(Path("array"), (Track(baseline.sensor, scans, None),), rate_hz)

@@ -102,7 +102,13 @@ def stored_baselines(
 def of_single_csv(baselines: Mapping[str, Baseline], played: str) -> Mapping[str, Baseline]:
     """Return a single baseline under the name of the single CSV that is played, which states no sensor."""
     file = played.removeprefix("replay:")
-    if len(baselines) != 1 or file == played or "," in file or not file.lower().endswith(".csv"):
+    if (
+        not isinstance(baselines, Mapping)
+        or len(baselines) != 1
+        or file == played
+        or "," in file
+        or not file.lower().endswith(".csv")
+    ):
         return baselines
     sensor = harmless(Path(file).stem, kept="")  # as the reader of the file names it
     (baseline,) = baselines.values()

@@ -156,7 +156,7 @@ class JsonLinesSink(Sink):
         stop: threading.Event | None = None,
         fields: str | None = None,
     ) -> None:
-        """Open the target; an older file of records is replaced. Readers of a recording's records are waited for."""
+        """Open the target; the first record replaces an older file of them. A recording waits for its readers."""
         self._target = "stdout" if target == "-" else target
         self._source, self._stop, self._waits = source.kind, stop or threading.Event(), source.kind == "replay"
         names = None if fields is None else chosen_fields(fields)
@@ -174,6 +174,7 @@ class JsonLinesSink(Sink):
             with suppress(OSError):  # other pipes have taken the pages that a user may have
                 fcntl.fcntl(self._file.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self._may_be_full = not stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
+        self._replaces = target != "-" and not self._may_be_full
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Write one record; its counter `unwritten` counts what was left out for this reader only."""
@@ -196,6 +197,9 @@ class JsonLinesSink(Sink):
                 return
         written = 0
         try:
+            if self._replaces:  # not before: a run that does not begin must not cost the records of the one before
+                self._file.truncate(0)
+                self._replaces = False
             while written < len(line):  # a disk that fills takes a part of it, and refuses the rest
                 written += self._file.write(line[written:])
         except BrokenPipeError as error:
@@ -261,7 +265,6 @@ def _open(target: str) -> FileIO:
             file.seek(0)
             if file.read(len(_BEGINNING)) not in (b"", _BEGINNING):
                 raise OSError(errno.EEXIST, "it holds something else: give another name, or delete it first")
-            file.truncate(0)
         return file
     descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)  # a blocking open would wait for a reader
     os.set_blocking(descriptor, True)

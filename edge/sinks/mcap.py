@@ -91,6 +91,7 @@ class McapScans:
         Raises:
             SinkError: the file exists, or cannot be written.
         """
+        self._path = path
         self.offset_ns = time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns
         self.scans = self.messages = 0
         taxels = sensors.geometry.taxel_count
@@ -219,9 +220,11 @@ class McapScans:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close the file as it is."""
+        """Close the file as it is; one without a message, or of which no scan could be written, is deleted."""
         self._executor.shutdown()
         self._file.close()
+        if not self.scans and (self._failed or not self.messages):
+            self._path.unlink(missing_ok=True)
 
     def drain(self) -> None:
         """Wait until only the open chunk is not on the disk yet."""
@@ -328,10 +331,8 @@ class McapSink(Sink):
         """Finish the file; one without a message is deleted."""
         if self._failed:
             self._file.abandon()
-            return
-        self._try(self._file.close)
-        if not self._file.messages:
-            self._path.unlink(missing_ok=True)
+        else:
+            self._try(self._file.close)
 
     def _add_result(self, result: Result, counters: Mapping[str, int]) -> None:
         scan, to = result.scan, self._file
@@ -367,6 +368,6 @@ class McapSink(Sink):
             act(*given)
         except OSError as error:
             self._failed = True
-            reason = error.strerror or error
-            words = f"recording into {self._path} stopped: {reason}; its {self.scans} scans can be played"
-            raise SinkError(words) from error
+            stopped = f"recording into {self._path} stopped: {error.strerror or error}"
+            held = f"its {self.scans} scans can be played" if self.scans else "no scan of it was written: it is deleted"
+            raise SinkError(f"{stopped}; {held}") from error

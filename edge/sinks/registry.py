@@ -1,5 +1,6 @@
 """Registry of the sinks, by the names that a user writes, and the fan-out of a run's results to all of them."""
 
+import os
 import sys
 import threading
 import time
@@ -15,6 +16,7 @@ from edge.perception.result import Result
 from edge.pipeline.commands import Commands
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
+from edge.validation import check_kind
 from firmware_bridge.errors import as_typed, how_to_install
 from firmware_bridge.poses import TimedPose
 
@@ -127,6 +129,7 @@ class Form(NamedTuple):
 
 def check_sink(text: str) -> tuple[str, str]:
     """Return name and target of the sink that `text` names, or raise a UsageError; nothing is opened."""
+    check_kind("sink", text, "partition", "text, as after --sink")
     name, _, target = text.partition(":")
     form = FORMS.get(name)
     if name == "npz" and target:
@@ -141,9 +144,13 @@ def check_sink(text: str) -> tuple[str, str]:
 
 def check_apart(texts: Sequence[str]) -> None:
     """Raise a UsageError where a sink is there twice: both would write to the same place."""
+    places: dict[tuple[str, str], str] = {}
     for text in texts:
-        if texts.count(text) > 1:
-            raise UsageError(f"sink {text!r} is there {texts.count(text)} times: leave one")
+        name, _, target = text.partition(":")
+        place = name, os.path.realpath(target)
+        if place in places:
+            raise UsageError(f"sinks {places[place]!r} and {text!r} write to the same place: leave one out")
+        places[place] = text
 
 
 def open_sink(
@@ -171,6 +178,8 @@ def open_sink(
         SinkError: it cannot be opened.
     """
     name, target = check_sink(text)
+    check_kind("contract", contract, "output_unit", "that of the model, as load_model(...).contract")
+    check_kind("source", source, "sensor_file", "an open one: with open_source(...) as source")
     if name in ("mcap", "ros2", "rerun") and contract.output_unit != "mm":
         raise UsageError(f"{text}: the model's patterns are in {contract.output_unit!r}, expected mm: use another sink")
     # Each is imported only where it is used, which saves start-up time and memory.

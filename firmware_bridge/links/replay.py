@@ -234,9 +234,12 @@ def _due_times_ns(recording: Recording, track: Track, rate_hz: float | None) -> 
         return track.time_ns - first_ns
     rate_hz = recording.rate_hz if rate_hz is None else rate_hz
     if rate_hz is None:
-        raise SourceError(f"{recording.path} does not state its rate: pass --rate-hz")
-    if (len(track.counts) - 1) / rate_hz > LAST_TIME_NS / NS_PER_S:
-        raise SourceError(
-            f"{recording.path} lasts {len(track.counts) / rate_hz:.3g} s at {rate_hz:g} Hz: give a higher rate"
-        )
-    return np.rint(np.arange(len(track.counts)) * (NS_PER_S / rate_hz)).astype(np.int64)
+        why = "".join(f"; {note}" for note in recording.notes)
+        raise SourceError(f"{recording.path} does not state its rate: pass --rate-hz{why}")
+    due_ns = np.arange(len(track.counts)) * (NS_PER_S / rate_hz)
+    if recording.pauses is not None:  # as long as they were, however fast it is played: no tap goes on over an outage
+        due_ns += np.cumsum(recording.pauses) * (NS_PER_S / (recording.rate_hz or rate_hz))
+    if due_ns[-1] > LAST_TIME_NS:
+        lasting_s = due_ns[-1] / NS_PER_S
+        raise SourceError(f"{recording.path} lasts {lasting_s:.3g} s at {rate_hz:g} Hz: give a higher rate")
+    return np.rint(due_ns).astype(np.int64)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from firmware_bridge.errors import RecordingError, harmless
 from firmware_bridge.pad_geometry import AXES, PADS, USPA44, SensorGeometry
 from firmware_bridge.poses import PadPose, TimedPose
-from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, is_rate
+from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, check_raw, is_rate
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
 
@@ -46,20 +46,48 @@ def csv_header(taxel_count: int = USPA44.taxel_count) -> tuple[str, ...]:
     return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
 
 
-def _rate_of(name: str, times: ArrayLike) -> float | None:
-    """Return the rate of scans in [Hz] by their times (n,) in a column of this name; None where it cannot be told."""
+class _Pace(NamedTuple):
+    """Rate of scans in [Hz] by a column of times, or why there is none, and pauses (n,) before them, in periods."""
+
+    rate_hz: float | None
+    doubt: str
+    pauses: NDArray[np.float64] | None = None
+
+    def __str__(self) -> str:
+        text = f"no rate: {self.doubt}" if self.rate_hz is None else f"{self.rate_hz:.4g} scans/s"
+        if self.pauses is None:
+            return text
+        place, many = int(self.pauses.argmax()), int(np.count_nonzero(self.pauses))
+        longest = self.pauses[place] + 1
+        lasting = f"{longest:.0f} periods" if self.rate_hz is None else f"{longest / self.rate_hz:.1f} s"
+        return f"{text}; before scan {place + 1} there is a gap of {lasting}" + (f", one of {many}" if many > 1 else "")
+
+
+def _pace_of(name: str, times: ArrayLike) -> _Pace:
+    """Return the pace of scans by their times (n,) in a column of this name."""
     values = np.asarray(times, dtype=np.float64)
+    unread = np.flatnonzero(~np.isfinite(values))
+    if unread.size:
+        return _Pace(None, f"that of scan {unread[0] + 1} is neither a number nor a date and time")
     steps = np.diff(values)
-    if not steps.size or not np.isfinite(values).all() or steps.min() < 0:
-        return None
+    if not steps.any():
+        return _Pace(None, "they never change" if steps.size else "there is one alone")
     usual = float(np.percentile(steps, 90))
     # A gap of ten usual steps says nothing about the rate.
-    step = float(steps[steps <= 10 * usual].mean() if usual else steps.mean())
-    units = [_UNITS[word] for word in _words(name) if word in _UNITS]
-    if not units and not (steps == 1).all():  # such a column may as well number the rows
-        # No period of a sensor in this range is usual in two units.
-        units = [unit for unit in sorted(set(_UNITS.values())) if 0.0005 <= step / unit < 0.25]
-    return units[-1] / step if units and step else None
+    gaps = np.abs(steps) > (10 * usual if usual > 0 else np.inf)
+    step = float(steps[~gaps].mean())
+    pauses = np.concatenate([[0.0], np.where(gaps, np.abs(steps) / step - 1, 0.0)]) if gaps.any() and step > 0 else None
+    if steps.min() < 0:
+        return _Pace(None, f"they go back at scan {int(np.argmax(steps < 0)) + 2}", pauses)
+    named = [_UNITS[word] for word in _words(name) if word in _UNITS][-1:]
+    if not named and (steps == 1).all():
+        return _Pace(None, "they may as well number the scans")
+    # No period of a sensor in this range is usual in two units.
+    units = [unit for unit in named or sorted(set(_UNITS.values())) if 0.0005 <= step / unit < 0.25]
+    if units:
+        return _Pace(units[-1] / step, "", pauses)
+    unit = next((word for word, per_second in _UNITS.items() if [per_second] == named), "s, ms, us or ns")
+    return _Pace(None, f"their mean step, {step:.4g} {unit}, is that of no sensor (4 to 2000 scans/s)", pauses)
 
 
 def _taxels(pad: SensorGeometry) -> set[tuple[int, str]]:
@@ -184,11 +212,10 @@ class _Scans:
 
     def recording(self, path: Path, notes: list[str]) -> Recording:
         """Return the recording, with these notes and others."""
-        rates_hz = [_rate_of(self._time_names[column], times) for column, times in self._times.items()]
-        rate_hz = next((rate for rate in rates_hz if rate is not None and is_rate(rate)), None)
-        if rates_hz:
-            by = "which give no rate" if rate_hz is None else f"which give {rate_hz:.4g} scans/s"
-            notes.append(f"{path}: {_listed(self._time_names.values())} left out as times, {by}")
+        paces = [_pace_of(self._time_names[column], times) for column, times in self._times.items()]
+        pace = next((pace for pace in paces if pace.rate_hz is not None), paces[0] if paces else None)
+        if pace is not None:
+            notes.append(f"{path}: {_listed(self._time_names.values())} left out as times, which give {pace}")
         if self._left_out:
             notes.append(
                 f"{path}: {_listed(self._left_out)} left out as none of a taxel, a time or a pose; if one is, rename "
@@ -200,14 +227,16 @@ class _Scans:
             sound = np.abs(newtons).max(axis=(1, 2, 3)) <= HIGHEST_NEWTONS  # False of NaN
             vendor = tuple(VendorReading(force) if right else None for force, right in zip(newtons, sound, strict=True))
         counts = _by_axis(np.frombuffer(self._counts, np.int32), self._pad)
+        check_raw(path, counts)
         return Recording(
             path,
             (Track(harmless(path.stem, kept=""), counts, time_ns=None, vendor=vendor),),
-            rate_hz or _meta_rate_hz(path.with_name("meta_data.csv")),
+            (pace and pace.rate_hz) or _meta_rate_hz(path.with_name("meta_data.csv")),
             notes=tuple(notes),
             origin="emulated" if self._emulated else None,
             poses=self._poses,
             poses_by_row=True,
+            pauses=pace and pace.pauses,
         )
 
 

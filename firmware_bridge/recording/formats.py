@@ -15,8 +15,9 @@ def load_recording(path: str | Path) -> Recording:
     """
     path = Path(path)
     if path.is_dir():
-        there = ", ".join(sorted(file.name for file in path.glob("*.mcap"))[:5]) or "which holds no .mcap"
-        raise RecordingError(f"{path} is a folder: name a recording in it, as the .mcap of a rosbag2: {there}")
+        there = sorted(file.name for file in path.glob("*") if file.suffix in (".mcap", ".npz", ".csv"))[:5]
+        held = f"name a recording in it: {', '.join(there)}" if there else "it holds no .mcap, .npz or .csv"
+        raise RecordingError(f"{path} is a folder, expected a recording: {held}")
     # Each reader is imported where it is needed: that of MCAP loads a package.
     match path.suffix.lower():
         case ".csv":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.errors import CdrError
+from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.pad_geometry import SensorGeometry, pad_of
 from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.mounting import Mounting
@@ -78,6 +78,7 @@ class Recording:
             None if the file does not state it.
         poses: poses of the pads, in the order in which they were taken.
         poses_by_row: the times of the poses are rows of the scans, which have no times themselves.
+        pauses: (n,) time without a scan before each scan, in periods, of scans without times; None without any.
     """
 
     path: Path
@@ -90,6 +91,7 @@ class Recording:
     origin: Literal["device", "emulated"] | None = None
     poses: Sequence[TimedPose] = ()
     poses_by_row: bool = False
+    pauses: NDArray[np.float64] | None = None
 
 
 def origin_of(kinds: Iterable[str | None]) -> Literal["device", "emulated"] | None:
@@ -138,6 +140,21 @@ def read_mounting(text: str, taxel_count: int) -> Mounting:
         return Mounting(order, fields["swap_xy"], signs, tuple(map(float, gains)), taxel_count)
     except (TypeError, KeyError, RecursionError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from error
+
+
+def check_raw(name: object, counts: NDArray[Any]) -> None:
+    """Raise a RecordingError where counts (n, 3, rows, cols) are readings over a baseline that were cut off at 0.
+
+    Raw ones are far from 0; those of a broken chip are 0 on all its axes. Of eight grips that were cut off, a reading
+    in two was 0 on one axis and not on another, and their patterns look right.
+    """
+    zero = counts == 0
+    share = float((zero.any(axis=1) & ~zero.all(axis=1)).mean())
+    if share > 0.2:  # three taxels of sixteen
+        raise RecordingError(
+            f"{name}: {100 * share:.0f} % of the readings are 0 on one axis and not on another, as readings over a "
+            "baseline that were cut off at 0: expected raw counts, nothing subtracted"
+        )
 
 
 def check_times(fields: Mapping[str, Any], **least: int) -> None:

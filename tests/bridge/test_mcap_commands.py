@@ -198,6 +198,14 @@ class TestRecord:
         assert process.returncode == 5 and f"recorded {path}: at most " in said
         assert f"recording into {path} stopped: File too large; its " in said.splitlines()[-1]
 
+    @pytest.mark.parametrize("room_bytes", [0, 100, 4000])
+    def test_a_disk_without_room_for_one_scan_leaves_no_file(self, made, tmp_path, room_bytes):
+        path, disk = tmp_path / "full.mcap", partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room_bytes,) * 2)
+        process = start("record", path, *source_of(made, 60), preexec_fn=disk)
+        _, said = process.communicate()
+        assert process.returncode == 5 and "File too large" in said.splitlines()[-1] and not path.exists()
+        assert "can be played" not in said and f"recorded {path}" not in said
+
 
 def test_what_the_page_says_of_reading_it_works(tmp_path, monkeypatch, capsys):
     (script,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "recordings.md").read_text(), re.DOTALL)

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import can
@@ -9,7 +10,10 @@ import numpy as np
 import pytest
 from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_npz, write_recording
 from can.interfaces.slcan import slcanBus
+from edge_samples import FakeModel, make_scan
+from mcap_samples import SURE
 
+from edge.api import Event, Stream, infer, open_recording, open_runtime
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import FRAME_S, Controller, Emulator, SlcanAdapter, bus_timeline
 from firmware_bridge.errors import DeviceError, RecordingError, SourceError
@@ -150,6 +154,41 @@ def test_it_may_wait_for_a_sign_to_begin(tmp_path):
         assert [scan.time_ns for _ in range(3) for scan in link.read(1.0)] == [
             START_NS + (900 + due) * MS for due in (0, 100, 200)
         ]
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "going", "noted"), [(None, 1, "3.0 s"), (1000, 1, "3.0 s"), (100, -1, "298 periods")]
+)
+def test_no_tap_goes_on_over_a_gap_in_the_times_of_a_csv(tmp_path, rate_hz, going, noted):
+    """Nor where another recording, whose times begin anew, was put behind it."""
+    pressed = {*range(120, 130), *range(136, 200)}
+    counts = [make_scan(n, press_counts=3000 * (n in pressed), noise=3).counts for n in range(200)]
+    lines = write_recording(tmp_path / "all.csv", np.array(counts)).read_text().splitlines()
+    times = ["time", *(f"{(n + 299 * going * (n >= 150)) / 100:.2f}" for n in range(200))]
+    path = tmp_path / "finger.csv"
+    path.write_text("\n".join(f"{time},{line}" for time, line in zip(times, lines, strict=True)))
+    events: list[Event] = []
+    with open_recording(path, rate_hz=rate_hz) as source:
+        made = list(Stream(source, open_runtime(FakeModel(SURE), source), on_event=events.append))
+    assert f"before scan 151 there is a gap of {noted}" in events[0].text
+    assert [made[n].taps_used for n in (149, 150)] == [2, 1], "as live, after an outage"
+    assert made[150].scan.time_ns - made[149].scan.time_ns > 2_900_000_000
+
+
+@pytest.mark.parametrize(
+    ("cut_off", "words"), [(False, None), (True, "0 on one axis and not on another, as readings over")]
+)
+def test_readings_over_a_baseline_cut_off_at_0_are_no_counts(tmp_path, cut_off, words):
+    """Their patterns look right; a broken chip, whose counts are 0 on all axes, is another thing."""
+    counts = np.stack([make_scan(n, press_counts=3000 * (n > 90), noise=3).counts for n in range(150)])
+    counts[:, :, 0, :3] = 0
+    if cut_off:
+        counts = np.maximum(counts - counts[:9].mean(axis=0), 0).astype(int)
+    path = write_recording(tmp_path / "finger.csv", counts)
+    with nullcontext() if words is None else pytest.raises(RecordingError, match=rf"finger\.csv: .*{words}"):
+        open_recording(path, rate_hz=100)
+    with nullcontext() if words is None else pytest.raises(RecordingError, match=rf"counts: .*{words}"):
+        infer(FakeModel(), counts, counts[:9])
 
 
 # The demo: its emulator plays through, and has hung up however the demo ends.

@@ -7,6 +7,7 @@ import pytest
 from bridge_samples import REAL_RECORDINGS, write_npz
 from hostile_samples import one_line
 
+from edge.api import SourceError, open_recording
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.csv_reader import csv_header
@@ -186,19 +187,36 @@ def with_columns(names: str, cells: list[str]) -> str:
         ("datetime", ["2026-01-02 03:04:05.00", "2026-01-02 03:04:05.01", "2026-01-02T03:04:05.02"], 100),
         ("time", ["0", "0", "0", "40", "40", "40", "40", "80", "80"], 100),
         ("time", [f"{n / 100 + 30 * (n > 10):.2f}" for n in range(20)], 100),
-        ("t", ["0", "1", "2", "3"], None),
-        ("time", ["0.03", "0.02", "0.01"], None),
-        ("time", ["0", "", "0.02"], None),
-        ("time", ["00:00.0", "00:00.1", "00:00.2"], None),
-        ("time", ["5"], None),
     ],
 )
 def test_the_rate_of_a_csv_comes_from_its_times(tmp_path, name, times, rate_hz):
     recording = load_recording(write_csv(tmp_path, with_columns(name, times)))
     assert len(recording.tracks[0].counts) == len(times)
-    assert (recording.rate_hz is None) if rate_hz is None else recording.rate_hz == pytest.approx(rate_hz, rel=0.05)
+    assert recording.rate_hz == pytest.approx(rate_hz, rel=0.05)
     (note,) = recording.notes
     assert f"{name!r} is left out as times, which give" in note
+
+
+@pytest.mark.parametrize(
+    ("name", "times", "why"),
+    [
+        ("time", [0, 0.01, 0.02, 0.01], "they go back at scan 4"),
+        ("time", [0.03, 0.02, 0.01], "they go back at scan 2"),
+        ("time", ["00:00.0", "00:00.1"], "that of scan 1 is neither a number nor a date and time"),
+        ("time", [5], "there is one alone"),
+        ("time", [0, "", 0.02], "that of scan 2 is neither a number nor a date and time"),
+        ("time", [5, 5, 5], "they never change"),
+        ("time_ms", [0, 0.01, 0.02], "their mean step, 0.01 ms, is that of no sensor"),
+        ("time_s", [0, 10, 20], "their mean step, 10 s, is that of no sensor"),
+        ("t", [0, 1, 2], "they may as well number the scans"),
+        ("time", [0, 300, 600], "their mean step, 300 s, ms, us or ns, is that of no sensor"),
+    ],
+)
+def test_why_times_of_a_csv_give_no_rate(tmp_path, name, times, why):
+    path = write_csv(tmp_path, with_columns(name, [str(time) for time in times]))
+    with pytest.raises(SourceError, match=rf"finger\.csv does not state its rate: pass --rate-hz; .*{why}"):
+        open_recording(path)
+    assert open_recording(path, rate_hz=100).rate_hz == 100
 
 
 def test_other_columns_of_a_csv_are_named_and_left_out(tmp_path):
@@ -286,7 +304,7 @@ def test_files_that_cannot_be_read(tmp_path):
     for name, content, words in (
         ("gone.csv", None, r"gone\.csv: cannot be read: No such file"),
         ("gone.npz", None, r"gone\.npz: cannot be read: No such file"),
-        ("folder.csv", None, r"folder\.csv is a folder: name a recording in it, .*: which holds no \.mcap"),
+        ("folder.csv", None, r"folder\.csv is a folder, expected a recording: it holds no \.mcap"),
         ("finger.txt", b"", r"ends in \.csv, \.npz or \.mcap"),
         ("finger.csv", HEADER.encode(), r"finger\.csv, .*expected a row of counts"),
         ("finger.npz", b"", "finger"),

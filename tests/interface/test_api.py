@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from cli_samples import files, records, run, write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan
-from mcap_samples import arrays_of
+from mcap_samples import SURE, arrays_of
 from pose_samples import PosedModel, make_posed_contract, posed_pattern
 
 from edge import api
@@ -111,6 +111,19 @@ def stream(source, model=None, **settings):
         ),
         (lambda source: open_runtime(FakeModel(), source, baselines={"4": 1}), "baseline of sensor 4 is a int"),
         (lambda source: open_runtime(FakeModel(), source, baselines=[BASELINE]), "baselines are a list, expected"),
+        (lambda source: open_runtime(FakeModel(), source, baselines=5), "baselines are a int, expected"),
+        (lambda source: open_runtime(None, source), "model is None, expected the name of one, its file"),
+        (lambda source: open_sink(5, SURE, source), "sink is 5, expected text"),
+        (lambda source: open_sink("jsonl:-", load_model("stsr"), source), "contract is .*, expected that of the model"),
+        (lambda source: open_sink("jsonl:-", SURE, None), "source is None, expected an open one"),
+        (lambda source: stream(source, sinks=[5]), "sink is 5, expected what open_sink returned"),
+        (lambda source: stream(source, sinks=5), "sinks is 5, expected a list"),
+        (lambda source: Stream(source, None), "runtime is None, expected what open_runtime returned"),
+        (lambda _: Stream(None, None), "source is None, expected an open one"),
+        (lambda _: api.Commands().put("zero"), r'command is \'zero\', expected a Command, such as Command\("zero"\)'),
+        (lambda _: api.Commands().poses.put(PadPose(0, 0)), "pose is PadPose.*, expected a TimedPose"),
+        (lambda _: api.ObjectMap(centre_mm=(NAN, 0)), r"centre of a map is \(nan, 0\), expected two finite numbers"),
+        (lambda _: api.ObjectMap(centre_mm=(1,)), r"centre of a map is \(1,\), expected two finite numbers"),
         (lambda source: stream(source, duration_s=-1), "duration_s is -1, expected a positive number"),
         (lambda source: api.take_baselines(source, scans=0), "scans is 0, expected a whole number from 100"),
         (lambda source: api.take_baselines(source, skip=-1), "skip is -1, expected a whole number from 0"),

@@ -141,7 +141,8 @@ def test_a_refusal_is_one_line_with_its_code_and_all_files_stay(code, typed, wor
     [
         (["--sink", "jsonl:-", "--fields", "force_n,patern"], ["no field 'patern'", "did you mean pattern?"]),
         (["--fields", "force_n"], ["--fields requires a sink of JSON records"]),
-        (["--sink", "jsonl:-", "--sink", "jsonl:-"], ["'jsonl:-' is there 2 times", "leave one"]),
+        (["--sink", "jsonl:-", "--sink", "jsonl:-"], ["sinks 'jsonl:-' and 'jsonl:-' write to the same place"]),
+        (["--sink", "jsonl:a", "--sink", "mcap:a.mcap", "--sink", "jsonl:./a"], ["'jsonl:a' and 'jsonl:./a'"]),
         (["--sink", "zenoh:a//b"], ["'a//b'", "words with '/' between"]),
     ],
 )

@@ -192,7 +192,7 @@ def test_files_of_version_0_1_are_read(tmp_path):
             2,
             "text.npz becomes no .csv: edge-sr convert text.npz text.mcap; edge-sr convert text.mcap",
         ),
-        ("bag new.mcap", 2, "bag is a folder: name a recording in it"),
+        ("bag new.mcap", 2, "bag is a folder, expected a recording"),
         ("press.mcap taken.npz", 5, "taken.npz exists: give another name, or delete it first"),
         ("press.mcap none/new.npz", 5, "cannot write none/new.npz: No such file"),
         ("text.mcap new.npz", 2, "text.mcap: not an MCAP file"),

@@ -114,7 +114,9 @@ def test_each_scene_is_announced_and_then_told_how_it_went(recording, tmp_path):
     assert first[0].startswith("now another surface is ") and first[2].startswith("now a magnet comes ")
     assert second[::2] == first[::2]
     assert first[1].startswith("no tap was dropped") and first[3] == "none of 2 patterns with the magnet was checked"
-    assert second[1] == "earlier taps were dropped 1 times" and second[3].startswith("1 of 2 patterns with the magnet")
+    assert second[1] == "times that earlier taps were dropped: 1" and second[3].startswith(
+        "1 of 2 patterns with the magnet"
+    )
     assert len(told_of_scenes(results[:7], tmp_path / "scenes.npz")) == 3, "a scene that is cut off has no outcome"
 
 

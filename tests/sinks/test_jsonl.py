@@ -38,6 +38,13 @@ class TestJsonLines:
             assert path.read_bytes() == expected, "there as soon as it is written"
         sink.close()
 
+    def test_a_run_that_does_not_begin_leaves_the_old_records(self, tmp_path):
+        """As of `edge-sr --sink jsonl:out.jsonl --sink mcap:FILE` where FILE exists."""
+        path = tmp_path / "out.jsonl"
+        path.write_text('{"time_ns":5,"sensor":"old"}\n')
+        open_sink(f"jsonl:{path}", CONTRACT, fake_source()).close()
+        assert path.read_text() == '{"time_ns":5,"sensor":"old"}\n'
+
     @pytest.mark.parametrize("content", [b"txl1_x,txl1_y\n", b'{\n  "format": "tactile-baseline"', b"\x89MCAP", b"{"])
     def test_what_holds_no_records_is_not_replaced(self, tmp_path, content):
         """As of `edge-sr replay press.csv --sink jsonl:press.csv`, which left no recording."""
