@@ -163,6 +163,15 @@ def test_emulated_sensors_and_devices_teach_each_other_nothing(tmp_path, capsys)
     assert "pads of 4\n" in capsys.readouterr().out and load_sensor_file(out).sensors["4"].emulated == emulated
 
 
+def test_what_is_not_read_of_a_recording_is_told(tmp_path, capsys):
+    path = gripped(tmp_path) / "trial/xela_4.csv"
+    rows = path.read_text().splitlines(keepends=True)
+    path.write_text("".join([*rows[:450], "1,2,3\n", *rows[450:]]))
+    identify.main([str(tmp_path)])
+    expected = f"{path} is damaged, line 451: 3 columns, expected 48: only the 449 scans before that are read\n"
+    assert capsys.readouterr().err == expected
+
+
 def test_a_dead_taxel_is_one_line(tmp_path):
     path = gripped(tmp_path) / "trial/xela_4.csv"
     header, first, *rows = [line.split(",") for line in path.read_text().splitlines()]
