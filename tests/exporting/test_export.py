@@ -199,7 +199,7 @@ def test_what_cannot_be_exported_ends_in_one_line(tmp_path):
             main([*options, str(tmp_path / out)])
 
 
-def test_checkpoints_that_do_not_belong_together_are_refused_before_the_first(folder, tmp_path):
+def test_checkpoints_that_do_not_belong_together_are_refused(folder, tmp_path):
     PRESSES.save(tmp_path / "taps.npz")
     coarse = {name: getattr(PRESSES, name)[:, ::5, ::5] for name in ("patterns", "touching")}
     replace(PRESSES, **coarse).save(tmp_path / "coarse.npz")

@@ -3,7 +3,8 @@ import pytest
 from bridge_samples import write_npz
 
 from edge.doctor.guided_press import orders
-from edge.inference.bundled import example_recording
+from edge.inference.bundled import example_recording, find_model
+from edge.inference.onnx_session import ModelSession
 from edge.perception.gain_learning import load_contact_model
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
@@ -12,7 +13,7 @@ from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import identify
-from train.data.real_grips import recording_paths, recordings_folder
+from train.data.real_grips import play, recorded_grips, recording_paths, recordings_folder
 from train.errors import DatasetError
 from train.families.family_shares import BARE
 from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z, learned, write_model
@@ -21,7 +22,7 @@ from train.physics.pad_draws import RANGES
 from train.physics.pad_draws import Pad as SimulatedPad
 
 FOLDER = recordings_folder()
-AS_WIRED = Mounting()
+AS_WIRED, TURNED = Mounting(), Mounting(orders()["turned by 90 degrees clockwise"], True, (1, -1, -1))
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +75,7 @@ def test_weak_and_clipped_contacts_are_not_used(mixture):
         learned(read[:5], mixture.model())
 
 
-def test_the_contacts_that_were_there_stay_until_new_ones_are_whole(mixture, tmp_path):
+def test_former_contacts_stay_until_new_ones_are_whole(mixture, tmp_path):
     path = tmp_path / "contacts.npz"
     for _ in range(2):
         write_model(path, mixture, mixture.model())
@@ -119,11 +120,18 @@ def gripped(folder, mounting=AS_WIRED, *columns):
     return folder
 
 
+def test_a_turned_pad_is_played_as_an_even_one(tmp_path):
+    model, patterns = ModelSession(find_model("stsr-small-int8")), []
+    for name, mounting in (("even", AS_WIRED), ("turned", TURNED)):
+        grips = recorded_grips(gripped(tmp_path / name, mounting), SensorFile(sensors={"4": SensorEntry(mounting)}))
+        patterns.append(play(grips[0], model).patterns)
+    np.testing.assert_allclose(*patterns, atol=1e-5)
+
+
 def test_gains_belong_to_the_places_and_axes_of_the_mounting(tmp_path, capsys):
     """Gains stay with their chips: a pad that is turned in the gripper reads the same contacts, elsewhere."""
-    turned = Mounting(orders()["turned by 90 degrees clockwise"], True, (1, -1, -1))
     pads = []
-    for name, mounting in (("even", AS_WIRED), ("turned", turned)):
+    for name, mounting in (("even", AS_WIRED), ("turned", TURNED)):
         out = tmp_path / f"{name}.toml"
         save_sensor_file(out, SensorFile(sensors={"4": SensorEntry(mounting)}))
         identify.main([str(gripped(tmp_path / name, mounting)), "--out", str(out)])
@@ -135,7 +143,7 @@ def test_gains_belong_to_the_places_and_axes_of_the_mounting(tmp_path, capsys):
     assert capsys.readouterr().out.endswith("pads of left, which was not in it\n"), "no gains of sensor 4"
 
 
-def test_an_emulated_sensor_teaches_a_device_nothing_nor_the_other_way(tmp_path, capsys):
+def test_emulated_sensors_and_devices_teach_each_other_nothing(tmp_path, capsys):
     emulated = frozenset({"baseline"})
     for name, entry, columns, told in (
         ("device", SensorEntry(), ("emulated",), "is of an emulated sensor, expected one of a device"),
@@ -155,6 +163,15 @@ def test_an_emulated_sensor_teaches_a_device_nothing_nor_the_other_way(tmp_path,
     assert "pads of 4\n" in capsys.readouterr().out and load_sensor_file(out).sensors["4"].emulated == emulated
 
 
+def test_what_is_not_read_of_a_recording_is_told(tmp_path, capsys):
+    path = gripped(tmp_path) / "trial/xela_4.csv"
+    rows = path.read_text().splitlines(keepends=True)
+    path.write_text("".join([*rows[:450], "1,2,3\n", *rows[450:]]))
+    identify.main([str(tmp_path)])
+    expected = f"{path} is damaged, line 451: 3 columns, expected 48: only the 449 scans before that are read\n"
+    assert capsys.readouterr().err == expected
+
+
 def test_a_dead_taxel_is_one_line(tmp_path):
     path = gripped(tmp_path) / "trial/xela_4.csv"
     header, first, *rows = [line.split(",") for line in path.read_text().splitlines()]
@@ -171,7 +188,7 @@ def test_a_pad_of_another_model_is_one_line(tmp_path):
         identify.main([str(folder), "--out", str(out)])
 
 
-def test_a_pad_that_no_trial_lets_go_of_or_that_nothing_presses_is_one_line(tmp_path):
+def test_a_pad_that_is_never_free_or_never_pressed_is_one_line(tmp_path):
     held = gripped(tmp_path / "held") / "trial/xela_4.csv"
     rows = held.read_text().splitlines(keepends=True)
     for lines, told in ((rows[:250], "lower than where .* let go of it"), (rows[:100], "nothing presses a pad")):

@@ -164,7 +164,7 @@ def test_what_cannot_be_trained_is_said_in_one_line(data, tmp_path, options, tol
         main([str(tmp_path), *given, *options, "--steps", "1"])
 
 
-def test_presses_that_do_not_belong_together_are_refused_before_the_training(data, tmp_path):
+def test_presses_that_do_not_belong_together_are_refused_first(data, tmp_path):
     data.save(tmp_path / "data.npz")
     coarse = {name: getattr(data, name)[:, ::5, ::5] for name in ("patterns", "touching")}
     replace(data, **coarse).save(tmp_path / "coarse.npz")

@@ -1,6 +1,7 @@
 """Recordings of real grips, played through the shipped runtime, and how well patterns show the flat faces they hold."""
 
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -78,11 +79,14 @@ def recording_paths(folder: Path) -> list[Path]:
 
 
 def check_track(recording: Recording, track: Track, entry: SensorEntry) -> None:
-    """Refuse what would teach something wrong of a sensor that the sensor file has as `entry`.
+    """Print what is not read of a recording, and refuse what would teach something wrong of a sensor.
+
+    The sensor file has it as `entry`.
 
     Raises:
         DatasetError: its pad is of another model, or only one of recording and file is of an emulated sensor.
     """
+    sys.stderr.writelines(f"{note}\n" for note in recording.notes)
     if track.geometry != USPA44 or entry.mounting.taxel_count != USPA44.taxel_count:
         got = f"{track.geometry.taxel_count} taxels, and {entry.mounting.taxel_count} in the sensor file"
         raise DatasetError(f"{recording.path} has {got}, expected the {USPA44.taxel_count} of a {USPA44.name} in both")

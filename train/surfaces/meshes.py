@@ -37,7 +37,7 @@ def mesh_file(name: str) -> tuple[Path, float]:
 def size_of(name: str) -> str:
     """Return a line with the size that is taken of the file in a name."""
     path, unit_mm = mesh_file(name)
-    unit = "taken as in mm: --unit-mm gives another unit" if unit_mm == 1 else f"by --unit-mm {unit_mm:g}"
+    unit = "taken as in mm (commands with --unit-mm take other units)" if unit_mm == 1 else f"by --unit-mm {unit_mm:g}"
     return f"{path.name}: {_sides(load_mesh(path, unit_mm).extents)}, {unit}"
 
 
