@@ -34,7 +34,7 @@ from train.physics.sensor_noise import Nuisances, apply_nuisances, jitter_poses
 from train.physics.tpsf import resample, resample_touching
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import SURFACES
-from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, PLACES_MM, TARGET_ANGLES_DEG
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, PLACES_MM, TARGET_ANGLES_DEG, Split
 
 TEST_FORCE_N: Final = 5.0
 """Force at which every tap of a frozen set ends, unless the sensor's largest depth is reached before, in [N]."""
@@ -51,17 +51,22 @@ _AT_ONCE: Final = 48  # sequences whose pose errors are drawn at once: so the bu
 
 
 @one_thread()
-def freeze(surfaces: Sequence[str] = SURFACES) -> FrozenSet:
+def freeze(
+    surfaces: Sequence[str] = SURFACES,
+    split: Split = "test",
+    scale: int = SCALE,
+    angle_step_deg: float = ANGLE_STEP_DEG,
+) -> FrozenSet:
     """Return the frames of the paper's protocol, in the simulated world with one pad, and a sensor for each sequence.
 
     A sequence is MAX_TAPS whole taps of one flat figure by the nominal pad, each turned by a step from the one before
-    and off by a robot's error; the newest, at the place of the test in four turns, is the target.
+    and off by a robot's error; the newest, at the place of a split in four turns, is the target.
 
     Source: Wu and Liu 2024, Sec. V and Table II.
     """
     taps, names = MAX_TAPS, [name for name in surfaces for _ in TARGET_ANGLES_DEG]
-    turns_deg = [angle - ANGLE_STEP_DEG * back for angle in TARGET_ANGLES_DEG for back in range(taps)]
-    sent = [Pose(*PLACES_MM["test"], turn_deg) for _ in surfaces for turn_deg in turns_deg]
+    turns_deg = [angle - angle_step_deg * back for angle in TARGET_ANGLES_DEG for back in range(taps)]
+    sent = [Pose(*PLACES_MM[split], turn_deg) for _ in surfaces for turn_deg in turns_deg]
     poses: list[Pose] = []
     while part := sent[len(poses) :][: _AT_ONCE * taps]:
         poses += jitter_poses(np.random.default_rng([SEED, len(poses) // (_AT_ONCE * taps)]), part)
@@ -84,8 +89,8 @@ def freeze(surfaces: Sequence[str] = SURFACES) -> FrozenSet:
         tap=np.repeat(np.arange(len(share)), FRAMES).astype(np.int16),
         indentation_mm=(end_mm[:, None] * moments).ravel().astype(np.float32),
         force_n=(end_n[:, :1] * moments).ravel().astype(np.float32),
-        unit_patterns=resample(unit_patterns, FINE_SCALE, SCALE).astype(np.float16),
-        touched=resample_touching(np.stack([sequence.touching[0] for sequence in solved]), FINE_SCALE, SCALE),
+        unit_patterns=resample(unit_patterns, FINE_SCALE, scale).astype(np.float16),
+        touched=resample_touching(np.stack([sequence.touching[0] for sequence in solved]), FINE_SCALE, scale),
         surface=np.array(names),
         angle_deg=true_poses[:, 0, 2].astype(np.float32),
         full_scale_mm=MAX_INDENTATION_MM,
