@@ -182,7 +182,7 @@ def examined(open_link, *arguments, out=None, err=None):
     """Return the exit code and the output of a visit to a link."""
     options, out = parser("doctor").parse_args([*map(str, arguments)]), out or io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(examine, "links_to", lambda *_, **__: [open_link()])
+        patch.setattr(examine, "links_to", lambda _, sensor_file, __: ([open_link()], sensor_file))
         return command.run(options, out, err or io.StringIO()), out.getvalue()
 
 
