@@ -54,7 +54,7 @@ def recording(*counts, rate_hz=200.0):
     return Recording(Path("made.csv"), tuple(tracks), rate_hz)
 
 
-TOO_FEW = re.compile(r'\b[1-9]\d? scans(?:", "norm": "| \(norm: )at least')
+TOO_FEW = re.compile(r'\b[1-9]\d? scans(?:", "norm": "| \(norm: )at least|only \d+ complete scans')
 
 
 def doctor(port, *arguments, **settings):
