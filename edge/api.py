@@ -37,9 +37,8 @@ from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.runtime_setup import infer, load_model, open_runtime
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.pipeline.source_setup import links_to, sensor_settings, with_recorded
+from edge.pipeline.source_setup import links_to, sensor_settings
 from edge.sinks.registry import Fan, open_sink
-from edge.validation import check_positive
 from firmware_bridge.errors import (
     BaselineRefusedError,
     BridgeError,
@@ -133,11 +132,7 @@ def open_source(
         UsageError: the id map does not exist or is not that of the sensor file; the rate or the time is out of range;
             a source is not a text.
     """
-    if rate_hz is not None:
-        check_positive("rate_hz", rate_hz)
     if not give_up_s >= 0:
         raise UsageError(f"give_up_s is {give_up_s}, expected 0 or more")
-    sensor_file = sensor_settings(sensor, id_map)
-    links = links_to(texts, sensor_file, rate_hz=rate_hz)
-    recorded = with_recorded(sensor_file, links)
-    return Source(*links, sensor_file=recorded, rate_hz=rate_hz, force=force, give_up_s=give_up_s)
+    links, sensor_file = links_to(texts, sensor_settings(sensor, id_map), rate_hz)
+    return Source(*links, sensor_file=sensor_file, rate_hz=rate_hz, force=force, give_up_s=give_up_s)

@@ -16,7 +16,7 @@ from edge.doctor.findings import Finding, judged
 from edge.doctor.link_checks import Watched
 from edge.doctor.taxel_checks import Samples
 from edge.errors import UsageError
-from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines, with_recorded
+from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines
 from edge.validation import check_baselines, check_positive
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.links.base import LinkReader
@@ -156,11 +156,8 @@ def prepare(
     """
     if len(texts) > 1:
         raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
-    if rate_hz is not None:
-        check_positive("rate_hz", rate_hz)
     check_baselines(before, sensor_file.model_map.geometry)
-    (link,) = links_to(texts, sensor_file, rate_hz=rate_hz)
-    sensor_file = with_recorded(sensor_file, [link])
+    (link,), sensor_file = links_to(texts, sensor_file, rate_hz)
     watched = Watched(model=sensor_file.model_map, rate_hz=rate_hz, references=before, mountings=sensor_file.mountings)
     return LinkReader(link), sensor_file, watched
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from edge.errors import UsageError
 from edge.inference.bundled import demo_recording
+from edge.validation import check_positive
 from firmware_bridge.errors import SensorFileError, harmless
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.registry import DEMO_LOOP, open_sources
@@ -42,18 +43,17 @@ def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) ->
     return sensor_file
 
 
-def links_to(
-    texts: Sequence[str],
-    sensor_file: SensorFile,
-    *,
-    rate_hz: float | None = None,
-) -> list[Link]:
+def links_to(texts: Sequence[str], sensor_file: SensorFile, rate_hz: float | None) -> tuple[list[Link], SensorFile]:
     """Return the links to the requested sources, else to the sensor file's adapter or the only one; not yet entered.
+
+    With them come the settings of their sensors, as `with_recorded` makes them.
 
     Raises:
         SourceError: as in open_sources; NoDeviceError and RecordingError as well.
-        UsageError: a source is not a text; the demo's recording is not installed.
+        UsageError: a source is not a text; the rate is out of range; the demo's recording is not installed.
     """
+    if rate_hz is not None:
+        check_positive("rate_hz", rate_hz)
     for text in texts:
         if not isinstance(text, str):
             raise UsageError(f"source is {text!r}, expected text, as after --source; of several each by itself")
@@ -61,7 +61,8 @@ def links_to(
         texts = [f"slcan:serial={sensor_file.adapter}"]
     demo = any(text.rpartition("=")[2] in ("demo", DEMO_LOOP) for text in texts)
     recording = demo_recording() if demo else None
-    return open_sources(texts, rate_hz, recording, sensor_file.model_map, mountings=sensor_file.mountings)
+    links = open_sources(texts, rate_hz, recording, sensor_file.model_map, mountings=sensor_file.mountings)
+    return links, with_recorded(sensor_file, links)
 
 
 def with_recorded(sensor_file: SensorFile, links: Iterable[Link]) -> SensorFile:

@@ -54,7 +54,7 @@ def recording(*counts, rate_hz=200.0):
     return Recording(Path("made.csv"), tuple(tracks), rate_hz)
 
 
-TOO_FEW = re.compile(r'\b[1-9]\d? scans(?:", "norm": "| \(norm: )at least')
+TOO_FEW = re.compile(r'\b[1-9]\d? scans(?:", "norm": "| \(norm: )at least|only \d+ complete scans')
 
 
 def doctor(port, *arguments, **settings):
@@ -182,7 +182,7 @@ def examined(open_link, *arguments, out=None, err=None):
     """Return the exit code and the output of a visit to a link."""
     options, out = parser("doctor").parse_args([*map(str, arguments)]), out or io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(examine, "links_to", lambda *_, **__: [open_link()])
+        patch.setattr(examine, "links_to", lambda _, sensor_file, __: ([open_link()], sensor_file))
         return command.run(options, out, err or io.StringIO()), out.getvalue()
 
 
