@@ -194,18 +194,14 @@ class BaselineEstimator:
 def save_baselines(
     path: str | Path, baselines: Iterable[Baseline], orders: Mapping[str, Sequence[int]] = MappingProxyType({})
 ) -> None:
-    """Write baselines, one per sensor, as one JSON file, in place; an existing file of them stays as NAME.bak.
+    """Write baselines, one per sensor, as one JSON file, in place; an existing file stays as NAME.bak.
 
     `orders` are those of the taxels of each sensor whose mounting differs from its id map.
 
     Raises:
-        RecordingError: the file cannot be written, or holds something else.
+        RecordingError: the file cannot be written.
     """
     path = Path(path)
-    if path.is_file() and path.stat().st_size:  # replaced twice, not even the NAME.bak would be what it was
-        with path.open("rb") as file:
-            if FILE_FORMAT.encode() not in file.read(1 << 16):
-                raise RecordingError(f"{path}: it holds something else: give another name, or delete it first")
     entries = [
         {
             "id": baseline.id,

@@ -126,7 +126,7 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (
             2,
             f"{ZERO}{{files}}/rest.npz --scans 100 --out {{tmp}}/other.onnx",
-            ["it holds something else: give another"],
+            ["other.onnx holds something else: give another"],
         ),
         (3, f"{ZERO}{{tmp}}/moving.npz", ["nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by"]),
         (3, f"{ZERO}{{files}}/taps.npz --skip 1", ["ended before 100 complete scans"]),
