@@ -47,11 +47,11 @@ def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:
         raise UsageError(
             f"baselines are a {type(baselines).__name__}, expected their file, or each by its sensor's name"
         )
-    for name, baseline in baselines.items():
+    for name, baseline in _named("baseline", baselines):
         if not isinstance(baseline, Baseline):
-            raise UsageError(f"baseline of sensor {name} is a {type(baseline).__name__}, expected a Baseline")
+            raise UsageError(f"{name} is a {type(baseline).__name__}, expected a Baseline")
         if baseline.counts.shape != geometry.scan_shape:
-            got = f"baseline of sensor {name} has shape {baseline.counts.shape}"
+            got = f"{name} has shape {baseline.counts.shape}"
             raise UsageError(f"{got}, expected {geometry.scan_shape}: zero again")
 
 
@@ -84,5 +84,8 @@ def check_counts_per_newton(counts: float | Mapping[str, float] | None) -> None:
 def _named(what: str, setting: Any) -> Iterable[tuple[str, Any]]:
     """Return the values of a setting with their names in a message: one for all sensors, one by each name, or none."""
     if isinstance(setting, Mapping):
+        for sensor in setting:
+            if not isinstance(sensor, str):
+                raise UsageError(f"{what} of sensor {sensor!r}: expected its name as text, such as '4'")
         return [(f"{what} of sensor {sensor}", value) for sensor, value in setting.items()]
     return [] if setting is None else [(what, setting)]

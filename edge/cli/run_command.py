@@ -50,6 +50,7 @@ from edge.sinks.status_line import MessageSink
 from edge.terminal.stop_signals import stop_on_signals
 from firmware_bridge.errors import as_typed
 from firmware_bridge.in_place import BACKUP_SUFFIX
+from firmware_bridge.zeroing.baseline import FILE_FORMAT
 
 if TYPE_CHECKING:
     from edge.api import MapSink
@@ -104,6 +105,10 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     from edge.api import take_baselines
 
     replaced = options.out.exists()
+    if options.out.is_file() and options.out.stat().st_size:  # replaced twice, not even its backup would be left
+        with options.out.open("rb") as file:
+            if FILE_FORMAT.encode() not in file.read(1 << 16):
+                raise UsageError(f"{options.out} holds something else: give another name, or delete it first")
     if len(options.source) == 1 and options.source[0].startswith("replay:") and options.skip is options.scans is None:
         from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
 

@@ -38,6 +38,7 @@ _UNITS: Final = {
 }
 _WHOLE_NUMBER: Final = re.compile(r"[0-9]{1,9}(\.0*)?")
 MOST_CSV_BYTES: Final = 1 << 30  # most bytes of a CSV: some eight hours of one sensor at 100 Hz
+LONGEST_PAUSE: Final = 1e5  # periods for which a gap in the times is waited at most: a clock may have been set
 LONGEST_CSV_LINE: Final = 1 << 14  # most characters of a line: fifty times a row of counts
 
 
@@ -59,7 +60,7 @@ class _Pace(NamedTuple):
             return text
         place, many = int(self.pauses.argmax()), int(np.count_nonzero(self.pauses))
         longest = self.pauses[place] + 1
-        lasting = f"{longest:.0f} periods" if self.rate_hz is None else f"{longest / self.rate_hz:.1f} s"
+        lasting = f"{longest:.4g} periods" if self.rate_hz is None else f"{longest / self.rate_hz:.4g} s"
         return f"{text}; before scan {place + 1} there is a gap of {lasting}" + (f", one of {many}" if many > 1 else "")
 
 
@@ -236,7 +237,7 @@ class _Scans:
             origin="emulated" if self._emulated else None,
             poses=self._poses,
             poses_by_row=True,
-            pauses=pace and pace.pauses,
+            pauses=None if pace is None or pace.pauses is None else np.minimum(pace.pauses, LONGEST_PAUSE),
         )
 
 

@@ -157,7 +157,8 @@ def test_it_may_wait_for_a_sign_to_begin(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "going", "noted"), [(None, 1, "3.0 s"), (1000, 1, "3.0 s"), (100, -1, "298 periods")]
+    ("rate_hz", "going", "noted"),
+    [(None, 1, "3 s"), (1000, 1, "3 s"), (100, -1, "298 periods"), (None, 1e7, "2.99e+07 s"), (None, 1e99, "e+99 s")],
 )
 def test_no_tap_goes_on_over_a_gap_in_the_times_of_a_csv(tmp_path, rate_hz, going, noted):
     """Nor where another recording, whose times begin anew, was put behind it."""
@@ -170,9 +171,9 @@ def test_no_tap_goes_on_over_a_gap_in_the_times_of_a_csv(tmp_path, rate_hz, goin
     events: list[Event] = []
     with open_recording(path, rate_hz=rate_hz) as source:
         made = list(Stream(source, open_runtime(FakeModel(SURE), source), on_event=events.append))
-    assert f"before scan 151 there is a gap of {noted}" in events[0].text
+    assert "before scan 151 there is a gap of " in events[0].text and noted in events[0].text
     assert [made[n].taps_used for n in (149, 150)] == [2, 1], "as live, after an outage"
-    assert made[150].scan.time_ns - made[149].scan.time_ns > 2_900_000_000
+    assert 2.9e9 < made[150].scan.time_ns - made[149].scan.time_ns < 1.01e12, "no replay waits for years"
 
 
 @pytest.mark.parametrize(

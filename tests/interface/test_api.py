@@ -112,6 +112,14 @@ def stream(source, model=None, **settings):
         (lambda source: open_runtime(FakeModel(), source, baselines={"4": 1}), "baseline of sensor 4 is a int"),
         (lambda source: open_runtime(FakeModel(), source, baselines=[BASELINE]), "baselines are a list, expected"),
         (lambda source: open_runtime(FakeModel(), source, baselines=5), "baselines are a int, expected"),
+        (
+            lambda source: open_runtime(FakeModel(), source, baselines={4: BASELINE}),
+            "baseline of sensor 4: expected its",
+        ),
+        (
+            lambda source: open_runtime(FakeModel(), source, pad={4: Pad()}),
+            "pad of sensor 4: expected its name as text",
+        ),
         (lambda source: open_runtime(None, source), "model is None, expected the name of one, its file"),
         (lambda source: open_sink(5, SURE, source), "sink is 5, expected text"),
         (lambda source: open_sink("jsonl:-", load_model("stsr"), source), "contract is .*, expected that of the model"),

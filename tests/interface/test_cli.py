@@ -123,6 +123,11 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, f"{MAP} {{tmp}}/m.npz --centre-mm 0 nan", ["finite numbers"]),
         (3, f"{KNOWN} --source slcan:/dev/none --sink jsonl:{{tmp}}/kept.jsonl", ["/dev/none", "no such port"]),
         (3, f"{KNOWN} --source slcan:serial=NOSUCH", ["NOSUCH"]),
+        (
+            2,
+            f"{ZERO}{{files}}/rest.npz --scans 100 --out {{tmp}}/other.onnx",
+            ["other.onnx holds something else: give another"],
+        ),
         (3, f"{ZERO}{{tmp}}/moving.npz", ["nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by"]),
         (3, f"{ZERO}{{files}}/taps.npz --skip 1", ["ended before 100 complete scans"]),
         (4, f"{REST} --model {{tmp}}/other.onnx", ["'pitch_mm' is 5.0", "4.7"]),
