@@ -74,7 +74,7 @@ class BlindSensor(NamedTuple):
 
 def blind_sensors(bench: Workbench, report: Report) -> None:
     """Train a model for each of ten sensors that were found with a weight, contacts and a ball, and judge it there."""
-    plan, compared_on = (Plan(48, 1), 24) if bench.quick else (Plan(4000, 1500), COMPARED)
+    plan, compared_on = (Plan(48, 1), 24) if bench.quick else (Plan(12_000, 4000), COMPARED)
     world = World(seed=_SEED, count=_SENSORS * _JUDGED, per_pad=_JUDGED, families=dict.fromkeys(SHARES, 1.0))
     figures = replace(world, families=dict.fromkeys(FIGURES, 1.0))
     sets = {"all": bench.presses("blind-all", world), "figures": bench.presses("blind-figures", figures)}
