@@ -96,8 +96,10 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
     table, objection, gains = compared(tiny, found, sets, [])
     rows = [line.split(" | ")[0] for line in table.splitlines()]
-    assert rows == ["method", OWN, "stsr-int8", "bilinear", "over stsr-int8"] and gains["figures"] in table
+    assert rows == ["method", OWN, "stsr-int8", "bilinear", "over stsr-int8", "pads below it"]
+    assert gains["figures"] in table
     assert objection is not None and "on figures it is -" in objection and "to stsr-int8" in objection
+    assert "below stsr-int8 on 100% of the pads that this may be, expected at most 20%" in objection
     rest = Baseline.from_counts("xela_4", np.full((2, 3, 4, 4), 30_000), created_unix_s=0.0)
     free = Grip("untouched", np.full((30, 3, 4, 4), 30_000), rest)
     _, objection, _ = compared(tiny, found, sets, [free])
