@@ -100,8 +100,7 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     assert gains["figures"] in table
     assert objection is not None and "on figures it is -" in objection and "to stsr-int8" in objection
     assert (
-        "below stsr-int8 on 100% of the pads that this may be, expected at most 20%: find more of its constants"
-        in objection
+        "below stsr-int8 on 100% of the pads that this may be, expected at most 20%: find more constants" in objection
     )
     _, objection, _ = compared(tiny, Knowledge("any", Pad(), RANGES), sets, [])
     assert "expected at most 20%" in objection and "constants" not in objection, "of a model for any sensor"
