@@ -3,9 +3,10 @@
 import pytest
 import torch
 from press_samples import make_press_set
+from torch import nn
 
 from train.data.press_batches import Batch, PosedBatches
-from train.networks.blocks import relative_rms_error
+from train.networks.blocks import relative_rms_errors
 from train.networks.compact import CompactNet, HeteroscedasticError, heteroscedastic_loss
 from train.networks.fusion import FusionNet
 from train.networks.named_networks import grown
@@ -62,7 +63,7 @@ def test_the_pattern_learns_as_if_there_were_no_deviation():
     truth = truth_like(pattern)
     of_both = torch.autograd.grad(heteroscedastic_loss(pattern, deviation, truth), list(learns.values()))
     pattern, *_ = net(window(taps=2))
-    alone = torch.autograd.grad(relative_rms_error(pattern, truth), list(learns.values()), allow_unused=True)
+    alone = torch.autograd.grad(relative_rms_errors(pattern, truth).mean(), list(learns.values()), allow_unused=True)
     for name, both, one in zip(learns, of_both, alone, strict=True):
         if name.startswith("uncertainty"):
             assert one is None
@@ -93,6 +94,27 @@ def test_light_pulls_count_as_much_as_firm_ones():
     assert 0 < share[0] == pytest.approx(share[1], rel=0.1)
     right = loss(net, Batch(window(taps=1), truth, traction=traction.detach()))
     assert float(right.detach()) == pytest.approx(alone, abs=1e-6)
+
+
+def test_what_earlier_taps_make_worse_than_the_newest_one_costs_more():
+    truth = truth_like(torch.zeros(2, 8, 8)) + 0.1
+
+    class Off(nn.Module):
+        def __init__(self, many: float, one: float) -> None:
+            super().__init__()
+            self.many, self.one = many, one
+
+        def forward(self, window, *_):
+            off = self.one if window.shape[1] == 3 else self.many
+            return truth * (1 + off), torch.full_like(truth, 0.1), torch.zeros(2, 3, 4, 4)
+
+    def loss(many: float, one: float, posed: bool = True) -> float:
+        batch = Batch(window(2), truth, poses=torch.zeros(2, 4, 5) if posed else None)
+        return float(HeteroscedasticError().loss(Off(many, one), batch))
+
+    assert loss(0.2, 0.4) == pytest.approx(loss(0.2, 0.2)) == pytest.approx(loss(0.2, 0.1, posed=False))
+    assert loss(0.2, 0.05) - loss(0.2, 0.1) == pytest.approx(loss(0.2, 0.1) - loss(0.2, 0.2), rel=0.05)
+    assert loss(0.2, 0.1) > loss(0.2, 0.2) + 0.2
 
 
 TOLERANCE = 1e-5

@@ -107,6 +107,7 @@ def _rows(
         alone = alone if rows else found
         row: Row = head | {"model": model.name, "taps": taps, "PSNR dB": with_interval(found, each)}
         row["over one tap"] = with_interval(found - alone, each) if rows else None
+        row["worse than one tap %"] = round(100 * float((found < alone).mean())) if rows else None
         rows.append(row | {"run time us": run_time_us})
     return rows
 

@@ -72,13 +72,13 @@ def relative_error(patterns: Tensor, truth: Tensor) -> Tensor:
     return ((patterns - truth).abs() / truth_size(truth)).mean()
 
 
-def relative_rms_error(patterns: Tensor, truth: Tensor) -> Tensor:
-    """Return the mean over (n, H, W) of each pattern's RMS error as a share of its truth's RMS.
+def relative_rms_errors(patterns: Tensor, truth: Tensor) -> Tensor:
+    """Return each pattern's RMS error as a share of its truth's RMS, (n,), of patterns (n, H, W).
 
     Its minimum is near the mean of the possible patterns, which gains 0.1 dB over their median (docs/decisions.md).
     """
     share = (patterns - truth) / truth_size(truth)
-    return (share.square().mean(dim=(1, 2)) + 1e-6).sqrt().mean()  # the root's slope at 0 is unbounded
+    return (share.square().mean(dim=(1, 2)) + 1e-6).sqrt()  # the root's slope at 0 is unbounded
 
 
 def truth_size(truth: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from edge.inference.intervals import near_pixels
 from firmware_bridge.pad_geometry import USPA44
 from train.data.press_batches import Batch
-from train.networks.blocks import Objective, PatternNet, Residual, relative_rms_error, truth_size
+from train.networks.blocks import Objective, PatternNet, Residual, relative_rms_errors, truth_size
 from train.networks.symmetric import Group, SymmetricConv2d, fields, scalars, vectors
 
 _HIDDEN: Final = 32
@@ -323,14 +323,26 @@ class Seen(NamedTuple):
     traction: Tensor  # (n, 3, h, w) in [kPa]
 
 
+WORSE_BY_TAPS: Final = 0.4
+"""Weight of the logarithm by which a pattern is worse than that of the same window's newest tap alone."""
+
+
 class HeteroscedasticError(Objective):
     """Objective of a network that predicts a pattern and its deviation: see `heteroscedastic_loss`."""
 
     def loss(self, net: nn.Module, batch: Batch) -> Tensor:
-        """Return the relative errors of patterns and tractions, and the likelihood loss of the deviations."""
+        """Return the relative errors of patterns and tractions, and the likelihood loss of the deviations.
+
+        What earlier taps make worse counts once more, so that a network learns when to lean on the newest one.
+        """
         posed = () if batch.poses is None else (batch.poses,)
         pattern, deviation, traction = net(batch.window, batch.pad, *posed)
         loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
+        if batch.poses is not None and batch.poses.shape[1] > 1:
+            with torch.no_grad():
+                alone = net(batch.window[:, :3], batch.pad, batch.poses[:, :1])[0]
+            share = relative_rms_errors(pattern, batch.pattern) / relative_rms_errors(alone, batch.pattern)
+            loss = loss + WORSE_BY_TAPS * torch.relu(share.log()).mean()
         if batch.traction is not None:
             simulated = batch.traction.isfinite().all(dim=(1, 2, 3))  # of a real sensor's taps it is not
             traction, truth = traction[simulated], batch.traction[simulated]
@@ -352,4 +364,4 @@ def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor) -> T
     error = (pattern.detach() - truth).abs() / size
     spread = deviation / sqrt(2) / size + 1e-3  # so that no pixel with a tiny error dominates
     uncertainty_error = spread.detach() * (spread.log() + error / spread)
-    return relative_rms_error(pattern, truth) + uncertainty_error.mean()
+    return relative_rms_errors(pattern, truth).mean() + uncertainty_error.mean()
