@@ -15,10 +15,17 @@ from typing import Any, Final, TextIO, TypeVar
 
 import numpy as np
 
-from edge.bench import contenders
-from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow, error_rows, force_floor_percent
-from edge.bench.contenders import Subject
 from edge.bench.provenance import provenance, this_machine, with_head
+from edge.bench.subjects import (
+    FORCE_RANGE_N,
+    FROZEN_FILE,
+    ErrorRow,
+    Subject,
+    chosen,
+    error_rows,
+    force_floor_percent,
+    subjects,
+)
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.terminal.progress_bar import progress
@@ -87,8 +94,8 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     except OSError as error:
         where = f"--out {options.out}"
         raise UsageError(f"{where}: cannot be made: {error.strerror}: name a folder to write in") from error
-    frozen = load_frozen_set(contenders.FROZEN_FILE)
-    everyone = contenders.chosen(contenders.subjects(frozen.scale, options.models, page.warn), options.only)
+    frozen = load_frozen_set(FROZEN_FILE)
+    everyone = chosen(subjects(frozen.scale, options.models, page.warn), options.only)
     threads = sorted(set(options.threads))
     # With fewer p99.9 rests on the longest few.
     few = "" if options.ticks >= 3000 else " (fewer than 3000: p99.9 and misses mean little)"
@@ -240,8 +247,8 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
 def _write(
     folder: Path, command: str, page: BenchPage, lines: Sequence[dict[str, Any]], models: Sequence[Path]
 ) -> None:
-    sources = ("edge/bench/accuracy.py", "edge/bench/timing.py")
-    made = provenance(command, sources, [*models, contenders.FROZEN_FILE])
+    sources = ("edge/bench/subjects.py", "edge/bench/timing.py")
+    made = provenance(command, sources, [*models, FROZEN_FILE])
     columns = dict.fromkeys(column for row in lines for column in row)
     try:
         with (folder / "bench.csv").open("w", newline="") as file:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge.bench.contenders import FROZEN_FILE, Subject, opened
+from edge.bench.subjects import FROZEN_FILE, Subject, opened
 from edge.errors import EdgeError
 from firmware_bridge.schedule import Clock, Sleep, Ticker
 

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -22,6 +23,7 @@ from firmware_bridge.poses import TimedPose
 
 LOOK_NS: Final = 500_000_000
 """Pause between two checks of the sinks' trouble, in [ns]: discovery of a reader may take a moment."""
+_UNWRITTEN: Final = attrgetter("unwritten")
 
 
 class Fan(Sink):
@@ -88,7 +90,7 @@ class Fan(Sink):
                 getattr(sink, act)(*given)
             except SinkError as error:
                 self._give_up(sink, error)
-        self.unwritten = self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
+        self.unwritten = self._given_up_unwritten + sum(map(_UNWRITTEN, self._sinks))
         if self._clock_ns() >= self._look_ns:
             self._look_ns = self._clock_ns() + LOOK_NS
             before, self._known_trouble = self._known_trouble, self._troubles()

@@ -190,7 +190,7 @@ class ReplayLink(Link):
 
     def _take(self) -> Scan:
         """Return the next scan."""
-        due_ns, lane, row = (int(column[self._place]) for column in (self._due_ns, self._lane, self._row))
+        due_ns, lane, row = map(int, (self._due_ns[self._place], self._lane[self._place], self._row[self._place]))
         while self._next_pose is not None and self._next_pose[0] <= due_ns:
             self._poses.append(self._next_pose[1].later(self.first_ns))
             self._next_pose = next(self._poses_to_come, None)

@@ -20,10 +20,9 @@ from program_cost import Ratio, ratio_of
 
 from edge.bench import command
 from edge.bench import provenance as reports
-from edge.bench.accuracy import FORCE_RANGE_N, error_rows, force_error_percent, force_floor_percent
 from edge.bench.command import front
-from edge.bench.contenders import Subject
 from edge.bench.provenance import UNKNOWN, file_hash, provenance, read_provenance, with_head
+from edge.bench.subjects import FORCE_RANGE_N, Subject, error_rows, force_error_percent, force_floor_percent
 from edge.bench.timing import back_to_back, paced
 from edge.cli.main import main
 from edge.evaluation.test_set import judge_model, load_frozen_set, mean_error
@@ -144,7 +143,7 @@ def test_ctrl_c_ends_it_in_a_line_and_keeps_what_was_measured(tmp_path):
     assert row["method"] == "linear map" and "paced_p50_us" not in row
 
 
-SOURCE = "edge/bench/contenders.py"
+SOURCE = "edge/bench/subjects.py"
 
 
 @pytest.fixture(scope="module")
