@@ -96,7 +96,7 @@ def test_light_pulls_count_as_much_as_firm_ones():
     assert float(right.detach()) == pytest.approx(alone, abs=1e-6)
 
 
-def test_what_earlier_taps_make_worse_than_the_newest_one_costs_more():
+def test_what_earlier_taps_make_worse_costs_more():
     truth = truth_like(torch.zeros(2, 8, 8)) + 0.1
 
     class Off(nn.Module):
