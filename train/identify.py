@@ -63,8 +63,6 @@ def contact_pads(folder: Path, file: SensorFile) -> dict[str, tuple[str, Pad]]:
             )
         learner = learned(distinct(counts), model)
         told[sensor.removeprefix("xela_")] = f"{learner.contacts} distinct contacts", learner.pad()
-    if not told:
-        raise DatasetError(f"nothing presses a pad in the recordings of {folder}: expected contacts of many shapes")
     return told
 
 
