@@ -214,7 +214,7 @@ def test_what_is_no_model_ends_in_one_line(tmp_path, content, complaint):
         list(verify(path, frozen()))
 
 
-def test_what_it_is_not_verified_on_or_written_to_ends_in_one_line(path, monkeypatch, tmp_path):
+def test_recordings_of_a_free_pad_or_a_bad_out_are_one_line(path, monkeypatch, tmp_path):
     free = np.random.default_rng(0).integers(29998, 30003, (50, 3, 4, 4))
     (tmp_path / "trial").mkdir()
     csv = write_recording(tmp_path / "trial/xela_4.csv", free)
