@@ -117,6 +117,7 @@ def export(
 ) -> tuple[str, str]:
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx; return a line that describes it, and the limits it exceeds.
 
+    One that exceeds a limit replaces no file.
     Parity is checked in float32, also for graphs that are then quantised; errors are those in the runtime's session.
     The model is for the pad of the test set `frozen`. Ranges of int8 are measured on the training taps `calibration`,
     and confidence is fitted on `validation`. What is None or empty is left out; without `intervals` the deviations stay
@@ -163,7 +164,11 @@ def export(
         contract.trust.update(trust.to_json())
     content = _content(model, contract, origin(report))
     Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
-    write_in_place(folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
+    path = folder / f"{name}.onnx"
+    if exceeded and path.exists():
+        exceeded += "; the file that was there stays"
+    else:
+        write_in_place(path, lambda draft: draft.write_bytes(content), load_session)
     line = f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*facts, *lost])}"
     return line, exceeded and f"{name}.onnx ({exceeded})"
 

@@ -20,7 +20,7 @@ import torch
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from edge.errors import EdgeError, ModelError
+from edge.errors import ModelError
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
@@ -42,7 +42,7 @@ from export.parity import (
 from export.to_onnx import MOST_LOSS_DB
 from firmware_bridge.pad_geometry import AXES
 from train.data.real_grips import recorded_sets
-from train.errors import CheckpointError, TrainError
+from train.errors import CheckpointError, ended_by_errors
 from train.learning.checkpoint import network_of, origin_of
 from train.networks.blocks import PatternNet
 from train.report import Report, Row, markdown
@@ -198,18 +198,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the table as a report, too")
     options = parser.parse_args(arguments)
     recordings = os.environ.get("TACTILE_RECORDINGS")
-    try:
+    with ended_by_errors("verify"):
+        out: Path | None = options.out
+        report = None if out is None else Report(out.stem, out.parent, __file__, [*options.models, FROZEN])
         frozen = load_frozen_set(FROZEN)
         folder = Path(recordings) if recordings else None
         rows = [row for path in options.models for row in verify(path, frozen, folder)]
-    except (ExportError, TrainError, EdgeError) as error:
-        sys.exit(f"verify: {error}")
-    table = [row.row() for row in worst(rows)]
-    sys.stdout.write(markdown(table) + "\n")
-    if options.out is not None:
-        report = Report(options.out.stem, options.out.parent, __file__, [*options.models, FROZEN])
-        report.table(table, f"With torch {torch.__version__}. Of the extreme windows the worst of each level is shown.")
-        report.write()
+        table = [row.row() for row in worst(rows)]
+        sys.stdout.write(markdown(table) + "\n")
+        if report is not None:
+            told = f"With torch {torch.__version__}. Of the extreme windows the worst of each level is shown."
+            report.table(table, told)
+            report.write()
     broken = sum(bool(row.broken) for row in rows)
     if broken:
         sys.exit(f"verify: {broken} of {len(rows)} comparisons break a bound")

@@ -280,7 +280,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         else:
             files = [f"kept in {options.out}"] if kept else []
             files += [f"the former file is now {options.out}{in_place.BACKUP_SUFFIX}"] if kept and replaced else []
-            if kept and visit.weighed:
+            if kept and visit.weighed and rehearsal is None:
                 then = f"python -m train.own {as_typed(options.out)} --recordings FOLDER --out mine"
                 files += wrapped(f"train a model for it alone: {then}", columns())
             kind = "" if link.kind == "device" else f" ({link.kind.upper()})"

@@ -25,7 +25,7 @@ from edge.perception.taps import Taps
 from edge.perception.taxel_health import Health, TaxelEstimator
 from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.perception.zeroing import BaselineDoubt, Zeroing
-from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads
+from edge.validation import check_baselines, check_counts_per_newton, check_kind, check_mountings, check_pads
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.poses import PadPose, PoseTrack
@@ -279,6 +279,7 @@ class Runtime:
 
         Without a sensor it is of every sensor without poses of its own; a pose that holds is one until the next.
         """
+        check_kind("pose", pose, "away_mm", "a PadPose")
         return self._tracks.setdefault(sensor, PoseTrack()).add(time_ns, pose, holds=holds)
 
     def lose_touch(self, sensors: str = "") -> None:

@@ -37,6 +37,7 @@ _UNITS: Final = {
     for word in words.split()
 }
 _WHOLE_NUMBER: Final = re.compile(r"[0-9]{1,9}(\.0*)?")
+SHORTEST_PERIOD_S: Final = 0.0005  # of the scans of any sensor
 MOST_CSV_BYTES: Final = 1 << 30  # most bytes of a CSV: some eight hours of one sensor at 100 Hz
 LONGEST_PAUSE: Final = 1e5  # periods for which a gap in the times is waited at most: a clock may have been set
 LONGEST_CSV_LINE: Final = 1 << 14  # most characters of a line: fifty times a row of counts
@@ -73,18 +74,20 @@ def _pace_of(name: str, times: ArrayLike) -> _Pace:
     steps = np.diff(values)
     if not steps.any():
         return _Pace(None, "they never change" if steps.size else "there is one alone")
-    usual = float(np.percentile(steps, 90))
+    named = [_UNITS[word] for word in _words(name) if word in _UNITS][-1:]
+    # Rows that are closer together than the scans of any sensor were written in a burst.
+    apart = steps[steps >= SHORTEST_PERIOD_S * min(named, default=1.0)]
+    usual = float(np.percentile(apart if len(apart) > 1 else steps, 90))
     # A gap of ten usual steps says nothing about the rate.
     gaps = np.abs(steps) > (10 * usual if usual > 0 else np.inf)
     step = float(steps[~gaps].mean())
     pauses = np.concatenate([[0.0], np.where(gaps, np.abs(steps) / step - 1, 0.0)]) if gaps.any() and step > 0 else None
     if steps.min() < 0:
         return _Pace(None, f"they go back at scan {int(np.argmax(steps < 0)) + 2}", pauses)
-    named = [_UNITS[word] for word in _words(name) if word in _UNITS][-1:]
     if not named and (steps == 1).all():
         return _Pace(None, "they may as well number the scans")
     # No period of a sensor in this range is usual in two units.
-    units = [unit for unit in named or sorted(set(_UNITS.values())) if 0.0005 <= step / unit < 0.25]
+    units = [unit for unit in named or sorted(set(_UNITS.values())) if SHORTEST_PERIOD_S <= step / unit < 0.25]
     if units:
         return _Pace(units[-1] / step, "", pauses)
     unit = next((word for word, per_second in _UNITS.items() if [per_second] == named), "s, ms, us or ns")

@@ -187,6 +187,7 @@ def with_columns(names: str, cells: list[str]) -> str:
         ("datetime", ["2026-01-02 03:04:05.00", "2026-01-02 03:04:05.01", "2026-01-02T03:04:05.02"], 100),
         ("time", ["0", "0", "0", "40", "40", "40", "40", "80", "80"], 100),
         ("time", [f"{n / 100 + 30 * (n > 10):.2f}" for n in range(20)], 100),
+        ("time", [f"{n // 12 * 0.12 + n % 12 * 0.0002 + 30 * (n >= 180):.4f}" for n in range(480)], 100),  # in bursts
     ],
 )
 def test_the_rate_of_a_csv_comes_from_its_times(tmp_path, name, times, rate_hz):

@@ -186,8 +186,12 @@ def test_the_command_writes_integers_and_says_what_they_cost(folder, tmp_path, l
         main([str(folder / "sure.pt"), "--out", str(tmp_path), *options])
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith("sure-int8.onnx: ") and "convolutions in int8" in line and "dB lost" in line
-    contract = ModelSession(tmp_path / "sure-int8.onnx").contract
+    contract = ModelSession(path := tmp_path / "sure-int8.onnx").contract
     assert contract.arithmetic == "int8" and set(contract.test_error) == {"1", "2"} == set(contract.confidence)
+    path.write_bytes(b"better")
+    with pytest.raises(SystemExit, match=r"sure-int8\.onnx \(more than .* dB; the file that was there stays\)"):
+        main([str(folder / "sure.pt"), "--out", str(tmp_path), *options])
+    assert path.read_bytes() == b"better" and not [*tmp_path.glob("*.bak")]
 
 
 def test_what_cannot_be_exported_ends_in_one_line(tmp_path):

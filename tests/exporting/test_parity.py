@@ -6,6 +6,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from bridge_samples import write_recording
 from export_samples import PRESSES, made_once, small_models
 from onnx import numpy_helper
 
@@ -211,6 +212,17 @@ def test_what_is_no_model_ends_in_one_line(tmp_path, content, complaint):
         main([str(path)])
     with pytest.raises(ModelError):
         list(verify(path, frozen()))
+
+
+def test_recordings_of_a_free_pad_or_a_bad_out_are_one_line(path, monkeypatch, tmp_path):
+    free = np.random.default_rng(0).integers(29998, 30003, (50, 3, 4, 4))
+    (tmp_path / "trial").mkdir()
+    csv = write_recording(tmp_path / "trial/xela_4.csv", free)
+    monkeypatch.setenv("TACTILE_RECORDINGS", str(tmp_path))
+    with pytest.raises(SystemExit, match=r"^verify: nothing presses a pad in the recordings of [^\n]*$"):
+        main([str(path)])
+    with pytest.raises(SystemExit, match=r"^verify: [^\n]*xela_4\.csv: File exists$"):
+        main([str(path), "--out", str(csv / "parity.md")])
 
 
 @pytest.fixture(scope="module")

@@ -130,6 +130,10 @@ def stream(source, model=None, **settings):
         (lambda _: Stream(None, None), "source is None, expected an open one"),
         (lambda _: api.Commands().put("zero"), r'command is \'zero\', expected a Command, such as Command\("zero"\)'),
         (lambda _: api.Commands().poses.put(PadPose(0, 0)), "pose is PadPose.*, expected a TimedPose"),
+        (
+            lambda source: open_runtime(FakeModel(), source).pose((1, 2, 3), 0),
+            r"pose is \(1, 2, 3\), expected a PadPose",
+        ),
         (lambda _: api.ObjectMap(centre_mm=(NAN, 0)), r"centre of a map is \(nan, 0\), expected two finite numbers"),
         (lambda _: api.ObjectMap(centre_mm=(1,)), r"centre of a map is \(1,\), expected two finite numbers"),
         (lambda source: stream(source, duration_s=-1), "duration_s is -1, expected a positive number"),

@@ -172,6 +172,20 @@ def test_what_is_not_read_of_a_recording_is_told(tmp_path, capsys):
     assert capsys.readouterr().err == expected
 
 
+def test_notes_of_a_recording_of_two_fingers_are_told_once(tmp_path, capsys):
+    """Of them the first is free, and the second has no weight."""
+    pressed = load_recording(example_recording()).tracks[0].counts
+    free = np.random.default_rng(6).integers(29998, 30003, pressed.shape)
+    counts = np.stack([free, pressed], axis=1).reshape(-1, 3, 4, 4)
+    path, times_ns = tmp_path / "both.npz", np.arange(len(pressed)).repeat(2) * 10_000_000
+    write_npz(path, counts, times_ns, ["4", "6"] * len(pressed), origin=np.array(["emulated"] * len(counts)))
+    emulated = SensorEntry(emulated=frozenset({"baseline"}))
+    save_sensor_file(out := tmp_path / "sensor.toml", SensorFile(sensors={"4": emulated, "6": emulated}))
+    with pytest.raises(SystemExit, match="counts per newton of sensor 6 are not in the sensor file"):
+        identify.main([str(path), "--ball-mm", "40", "--out", str(out)])
+    assert capsys.readouterr().err == f"{path} was recorded from an emulated sensor\n"
+
+
 def test_a_dead_taxel_is_one_line(tmp_path):
     path = gripped(tmp_path) / "trial/xela_4.csv"
     header, first, *rows = [line.split(",") for line in path.read_text().splitlines()]

@@ -294,6 +294,23 @@ def test_figures_go_to_tensorboard(tmp_path):
     assert [event.step for event in events.Scalars("loss")] == [50, 100]
 
 
+def test_a_disk_without_room_for_figures_ends_no_run(tmp_path):
+    code = """
+import resource, sys
+from dataclasses import replace
+from pathlib import Path
+sys.path[:0] = ["tests/training", "tests/support"]
+from test_training import RECIPE, trained
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+folder = Path(sys.argv[1])
+trained(folder, replace(RECIPE, steps=150), log_folder=folder)
+"""
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    (log,) = tmp_path.iterdir()
+    assert (done.returncode, done.stderr) == (0, f"{log}: no further figures: File too large\n")
+
+
 WORKER = """
 import os, sys, json, torch
 from dataclasses import replace

@@ -150,13 +150,19 @@ def _placed_counts(path: Path, entry: SensorEntry) -> NDArray[np.integer]:
 
 
 def recorded_sets(folder: Path, known: SensorFile = _UNKNOWN) -> list[ScanSet]:
-    """Return real scans under load, one set for each trial and sensor; repeated scans are left out."""
+    """Return real scans under load, one set for each trial and sensor; repeated scans are left out.
+
+    DatasetError as of `recorded_grips`, or if none is under load.
+    """
     sets: list[ScanSet] = []
     for grip in recorded_grips(folder, known):
         renewed = np.append(True, (np.diff(grip.counts, axis=0) != 0).any(axis=(1, 2, 3)))
         zeroed = grip.zeroed()[renewed]
         sets.append(ScanSet(grip.free.sensor, grip.trial, zeroed[loaded(zeroed)]))
-    return [scans for scans in sets if len(scans.counts)]
+    pressed = [scans for scans in sets if len(scans.counts)]
+    if not pressed:
+        raise DatasetError(f"nothing presses a pad in the recordings of {folder}: expected contacts of many shapes")
+    return pressed
 
 
 def neighbours_mean(z: NDArray[np.floating]) -> NDArray[np.floating]:

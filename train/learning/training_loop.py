@@ -12,6 +12,7 @@ import hashlib
 import io
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -23,9 +24,11 @@ from pickle import UnpicklingError
 from typing import Any, Final
 
 import torch
+from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboard.summary.writer.record_writer import RecordWriter
 from torch import distributed, nn
 from torch.nn.parallel import DistributedDataParallel
-from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import scalar
 
 from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
@@ -206,24 +209,39 @@ def _place(net: PatternNet, device: torch.device) -> PatternNet:
 
 
 class _Log:
-    """Progress bar on a terminal, and TensorBoard."""
+    """Progress bar on a terminal, and TensorBoard, whose figures end where the disk is full; the run goes on."""
 
     def __init__(self, name: str, done: int, steps: int, folder: Path | None) -> None:
         self._bar = progress(name, steps, "step", done=done)
-        self._writer = SummaryWriter(str(folder)) if folder else None
+        self._file = None
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            # Not SummaryWriter: its thread meets a full disk alone, and prints a traceback.
+            self._file = (folder / f"events.out.tfevents.{time.time_ns()}").open("wb", buffering=0)
+            self._write(Event(file_version="brain.Event:2"))
 
     def step(self, step: int, loss: float, rate: float) -> None:
         self._bar.update()
         if step % 50 == 0:
             self._bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
-            if self._writer:
-                self._writer.add_scalar("loss", loss, step)
-                self._writer.add_scalar("learning rate", rate, step)
+            self._write(Event(step=step, summary=scalar("loss", loss)))
+            self._write(Event(step=step, summary=scalar("learning rate", rate)))
+
+    def _write(self, event: Event) -> None:
+        if self._file is None:
+            return
+        event.wall_time = time.time()
+        try:
+            RecordWriter(self._file).write(event.SerializeToString())
+        except OSError as error:
+            sys.stderr.write(f"{self._file.name}: no further figures: {error.strerror or error}\n")
+            self._file.close()
+            self._file = None
 
     def close(self) -> None:
         self._bar.close()
-        if self._writer:
-            self._writer.close()
+        if self._file is not None:
+            self._file.close()
 
 
 def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
