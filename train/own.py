@@ -224,10 +224,10 @@ def compared(
             decides = name in (bundled.name, "bilinear") or what == TAPPED or (name == REPLACED and what != UNLIKE)
             if name != OWN and decides and (high < 0 if what == UNLIKE or name == REPLACED else low <= 0):
                 objections.append(f"on {what} it is {gain} dB to {name}")
-        if what not in (UNLIKE, TAPPED) and losing[what] > MOST_LOSING:
+        if TAPPED not in sets and what != UNLIKE and losing[what] > MOST_LOSING:  # taps show which pad it is
             objections.append(
                 f"on {what} it is below {bundled.name} on {losing[what]:.0%} of the pads that this may be, expected at "
-                f"most {MOST_LOSING:.0%}" + ": find more constants, the pitch first" * bool(knowledge.pad.constants)
+                f"most {MOST_LOSING:.0%}" + ": learn from its own taps, by train.taps" * bool(knowledge.pad.constants)
             )
     holes = {name: np.array([_holes(grip, model, knowledge.pad) for grip in grips]) for name, model in models.items()}
     for name, shares in holes.items() if grips else ():
