@@ -172,8 +172,8 @@ def result_of(pattern, traction=None, **more):
     return Result(pattern=pattern.astype(np.float32), traction=traction, wrench=wrench, **given)
 
 
-def disc(x_mm, y_mm, radius_mm, depth_mm=1.0):
-    return depth_mm * (np.hypot(X_MM - x_mm, Y_MM - y_mm) <= radius_mm)
+def disc(x_mm, y_mm, radius_mm):
+    return np.hypot(X_MM - x_mm, Y_MM - y_mm) <= radius_mm
 
 
 def test_two_contacts_have_areas_centres_and_shares_of_the_force():
