@@ -1,6 +1,7 @@
 """MCAP recordings of `edge-sr record`: whole whatever ended it, and replayed offline."""
 
 import json
+import os
 import re
 import resource
 import subprocess
@@ -62,6 +63,14 @@ def made(tmp_path_factory):
             return folder
         (folder / "press.mcap").unlink()
     raise AssertionError("no scan of the contact got its pattern in any of ten recordings")
+
+
+def recorded_within(most_bytes, *arguments):
+    """Return exit code and messages of a recorder that can write files so long at most, and so no bytecode."""
+    disk = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+    process = start("record", *arguments, preexec_fn=disk, env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"})
+    _, said = process.communicate()
+    return process.returncode, said
 
 
 def replayed(made, name, *options, file="press.mcap"):
@@ -192,18 +201,16 @@ class TestRecord:
         assert "breaks off (without an end" in recording.notes[0] or "within a record" in recording.notes[0]
 
     def test_of_a_full_disk_no_more_scans_are_claimed_than_are_sure(self, made, tmp_path):
-        path, disk = tmp_path / "full.mcap", partial(resource.setrlimit, resource.RLIMIT_FSIZE, (40_000, 40_000))
-        process = start("record", path, *source_of(made, 60), preexec_fn=disk)
-        _, said = process.communicate()
-        assert process.returncode == 5 and f"recorded {path}: at most " in said
+        path = tmp_path / "full.mcap"
+        code, said = recorded_within(40_000, path, *source_of(made, 60))
+        assert code == 5 and f"recorded {path}: at most " in said
         assert f"recording into {path} stopped: File too large; its " in said.splitlines()[-1]
 
     @pytest.mark.parametrize("room_bytes", [0, 100, 4000])
     def test_a_disk_without_room_for_one_scan_leaves_no_file(self, made, tmp_path, room_bytes):
-        path, disk = tmp_path / "full.mcap", partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room_bytes,) * 2)
-        process = start("record", path, *source_of(made, 60), preexec_fn=disk)
-        _, said = process.communicate()
-        assert process.returncode == 5 and "File too large" in said.splitlines()[-1] and not path.exists()
+        path = tmp_path / "full.mcap"
+        code, said = recorded_within(room_bytes, path, *source_of(made, 60))
+        assert code == 5 and "File too large" in said.splitlines()[-1] and not path.exists()
         assert "can be played" not in said and f"recorded {path}" not in said
 
 

@@ -106,8 +106,8 @@ class PosedRuntime(Runtime):
         return super().take(scan, clock_ns)
 
 
-def make_scans(count=6):
-    return [make_scan(number, time_ns=10**9 + number * STEP_NS, press_counts=3000, noise=3) for number in range(count)]
+def make_scans():
+    return [make_scan(number, time_ns=10**9 + number * STEP_NS, press_counts=3000, noise=3) for number in range(6)]
 
 
 def record(path, poses=POSES):

@@ -231,7 +231,7 @@ def test_a_full_disk_leaves_nothing(source, new, tmp_path):
     record_into(tmp_path / "press.mcap", make_results(scans))
     arrays_of(tmp_path / "press.mcap")
     (tmp_path / "press.npz").rename(tmp_path / "old.npz")
-    command = [sys.executable, "-c", RUN, "10000", source, new]
+    command = [sys.executable, "-B", "-c", RUN, "10000", source, new]  # bytecode would be cut off, too
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout) == (5, "") and f"cannot write {new}: File too large" in done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["old.npz", "press.mcap"]

@@ -197,12 +197,13 @@ class SlowModel(FakeModel):
     """Model that runs until the event loop lets it: with a loop that it blocked, it would not end."""
 
     def __init__(self):
+        super().__init__()
         self.begun, self.let = threading.Event(), threading.Event()
-        super().__init__(on_run=self.wait)
 
-    def wait(self):
+    def run(self, *window):
         self.begun.set()
         assert self.let.wait(10), "the event loop is blocked"
+        return super().run(*window)
 
 
 async def until(event):

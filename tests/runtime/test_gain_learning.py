@@ -34,9 +34,9 @@ ALL_ALIVE = np.zeros((4, 4), dtype=bool)
 FREE = np.zeros((3, 4, 4))
 
 
-def make_model(seed=0, kinds=3):
-    """Return a model of a few kinds of contacts on pads that are all alike, and what draws from each kind."""
-    rng = np.random.default_rng(seed)
+def make_model(seed=0):
+    """Return a model of three kinds of contacts on pads that are all alike, and what draws from each kind."""
+    rng, kinds = np.random.default_rng(seed), 3
     means = np.zeros((kinds, 2, GAINS))
     means[:, 0] = rng.normal(0, 0.3, (kinds, GAINS))
     means[:, 0, Z] = 1 + rng.normal(0, 0.25, (kinds, 16))
@@ -204,11 +204,11 @@ def scans_of(contacts, noise=0.0, holds=1):
     return scans
 
 
-def learning(scans, *, pad=None, learn=True, every_scan=False):
+def learning(scans, *, learn=True, every_scan=False):
     """Return the runtime that has learned from these scans, its model, and the results."""
     model = FakeModel(make_pad_contract(taps=1))
     options = RuntimeOptions(learn=learn, every_scan=every_scan)
-    runtime = make_runtime(model, contacts=MODEL, pad=pad, options=options)
+    runtime = make_runtime(model, contacts=MODEL, options=options)
     return runtime, model, [runtime.push(scan) for scan in scans]
 
 

@@ -44,18 +44,6 @@ def test_any_traction_gives_the_sums_over_its_pixels(height, width, pixel_mm, se
     np.testing.assert_allclose(wrench.torque_n_mm, torque, atol=1e-10 * pixel_mm**3)
 
 
-def test_a_pure_twist_has_no_force_and_is_clockwise_from_above():
-    """Shear k kPa/mm times the distance, square to it: k * 2 * integral of x^2, less what pixels leave of it."""
-    at = (np.arange(PIXELS) - 3.5) * CELL_MM
-    traction = np.zeros((3, PIXELS, PIXELS))
-    traction[0], traction[1] = -2 * at[:, None], 2 * at[None, :]  # to the right of the middle it pulls down the rows
-    twist = 2 * 2 * (4 * PITCH_MM) ** 4 / 12 * (1 - 1 / PIXELS**2) / 1000
-    wrench = wrench_of(traction, CELL_MM)
-    assert wrench.force_n == pytest.approx((0, 0, 0), abs=1e-9)
-    assert wrench.torque_n_mm == pytest.approx((0, 0, twist))
-    assert wrench.centre_of_pressure_mm is None
-
-
 @pytest.mark.parametrize(("share", "told"), [(0.99, False), (1.01, True), (-5, False)])
 def test_of_a_light_touch_no_centre_is_told(share, told):
     wrench = wrench_of(even(z=share * LEAST_FORCE_N * 1000 / AREA_MM2), CELL_MM)
@@ -172,8 +160,8 @@ def result_of(pattern, traction=None, **more):
     return Result(pattern=pattern.astype(np.float32), traction=traction, wrench=wrench, **given)
 
 
-def disc(x_mm, y_mm, radius_mm, depth_mm=1.0):
-    return depth_mm * (np.hypot(X_MM - x_mm, Y_MM - y_mm) <= radius_mm)
+def disc(x_mm, y_mm, radius_mm):
+    return np.hypot(X_MM - x_mm, Y_MM - y_mm) <= radius_mm
 
 
 def test_two_contacts_have_areas_centres_and_shares_of_the_force():

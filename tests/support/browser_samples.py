@@ -202,13 +202,13 @@ def number(page, name, sensor="4"):
     return page.locator(f'[data-sensor="{sensor}"] [data-number="{name}"]')
 
 
-def moves(page, name="force-now"):
-    before = part(page, name).inner_text()
-    playwright.expect(part(page, name)).not_to_have_text(before)
+def moves(page):
+    before = part(page, "force-now").inner_text()
+    playwright.expect(part(page, "force-now")).not_to_have_text(before)
 
 
-def live(page, sensor="4"):
-    page.wait_for_selector(f'[data-sensor="{sensor}"] [data-part="field"][data-live="yes"]')
+def live(page):
+    page.wait_for_selector('[data-sensor="4"] [data-part="field"][data-live="yes"]')
 
 
 def word(page, text, sensor="4"):

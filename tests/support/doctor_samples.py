@@ -14,9 +14,9 @@ REST = np.array([32_700, 32_900, 37_300])[:, None, None] + np.arange(16).reshape
 COUNTERS = {"received_bytes": 22 * 16 * 400, "frames": 16 * 400, "bad_lines": 0, "refusals": 0}
 
 
-def healthy_counts(scans: int = 400, seed: int = 0, sigma: float = 2.0) -> np.ndarray:
+def healthy_counts(scans: int = 400, sigma: float = 2.0) -> np.ndarray:
     """Return counts of a free, still pad, (scans, 3, 4, 4)."""
-    noise = np.random.default_rng(seed).normal(0, sigma, (scans, 3, 4, 4))
+    noise = np.random.default_rng(0).normal(0, sigma, (scans, 3, 4, 4))
     return np.rint(REST + noise).astype(np.int32)
 
 
@@ -44,13 +44,13 @@ def watched(scans: list[Scan], duration_s: float = 4.0, **changes) -> Watched:
     return Watched(scans={"4": scans}, **settings)
 
 
-def finger(place: int, force: float = 4000.0) -> np.ndarray:
+def finger(place: int) -> np.ndarray:
     """Return z of a finger on a corner as a person sees it, (4, 4), in counts."""
     rows, cols = np.indices((4, 4))
     at_row, at_col = divmod(place, 4)
     # A finger is wider than a taxel, and its middle lies a little inside.
     at_row, at_col = 0.3 + 0.8 * at_row, 0.3 + 0.8 * at_col
-    return force * np.exp(-((rows - at_row) ** 2 + (cols - at_col) ** 2) / 1.5)
+    return 4000.0 * np.exp(-((rows - at_row) ** 2 + (cols - at_col) ** 2) / 1.5)
 
 
 PUSHES = {0: (1, 1), 3: (-1, 1), 15: (-1, -1), 12: (1, -1)}
@@ -109,14 +109,14 @@ class Person:
             )
 
 
-def visit(mounting: Mounting | None = None, *, rest: int = 20, hold: int = 45) -> np.ndarray:
+def visit(mounting: Mounting | None = None, *, rest: int = 20) -> np.ndarray:
     """Return the deformations of a pad that a person presses as asked, (n, 3, 4, 4).
 
-    Between presses are `rest` scans; each press, and each push, takes `hold`.
+    Between presses are `rest` scans; each press, and each push, takes 45.
     """
     person, seen = Person(mounting), []
     for corner in CORNERS:
-        for request, scans in (("Let go", rest), (f"the {corner} corner", hold), ("push towards", hold)):
+        for request, scans in (("Let go", rest), (f"the {corner} corner", 45), ("push towards", 45)):
             person.hear(request)
             seen += [person.deformation()] * scans
     person.hear("Let go")

@@ -161,10 +161,10 @@ def tiny_traction(window_units: np.ndarray, scale: int) -> np.ndarray:
     return np.kron(window_units[0], np.ones((1, scale, scale)))
 
 
-def tiny_pattern(window_units: np.ndarray, scale: int = 10) -> np.ndarray:
+def tiny_pattern(window_units: np.ndarray) -> np.ndarray:
     """Return the tiny model's pattern for a window (taps, 3, rows, cols) in network units."""
     z = sum(window_units[tap, 2] * 10.0**-tap for tap in range(len(window_units)))
-    return np.kron(z, np.ones((scale, scale)))
+    return np.kron(z, np.ones((10, 10)))
 
 
 def tiny_deviation(pattern: np.ndarray) -> np.ndarray:
@@ -211,19 +211,17 @@ def ended(process: subprocess.Popen, within_s: float = 60) -> Iterator[subproces
 
 
 class FakeModel:
-    """Tiny model without onnxruntime; `on_run` is called before each run."""
+    """Tiny model without onnxruntime."""
 
-    def __init__(self, contract: Contract | None = None, on_run=lambda: None) -> None:
+    def __init__(self, contract: Contract | None = None) -> None:
         self.name = "fake"
         self.contract = contract or make_contract()
         self.windows: list[np.ndarray] = []
         self.pads: list[np.ndarray | None] = []
         self.deviation: np.ndarray | None = None
         self.traction: np.ndarray | None = None
-        self._on_run = on_run
 
     def run(self, window: np.ndarray, pad: np.ndarray | None = None, poses: np.ndarray | None = None) -> np.ndarray:
-        self._on_run()
         self.windows.append(window.copy())
         self.pads.append(pad)
         stiffness = np.float32(1 if pad is None else tiny_stiffness(pad))

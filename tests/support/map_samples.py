@@ -54,9 +54,9 @@ def result_of(
     return Result(make_scan(number, sensor=sensor), source, "perfect", "contact", **known | changes)
 
 
-def raster(turns=(0.0,), step_mm=4.0, half_mm=24.0):
+def raster(turns=(0.0,), step_mm=4.0):
     """Return poses of taps all over a figure, with no error, at turns one after the other."""
-    places = np.arange(-half_mm, half_mm + 0.1, step_mm)
+    places = np.arange(-24.0, 24.1, step_mm)
     both = [(x, y) for y in places for x in places]
     return [PadPose(float(x), float(y), turns[number % len(turns)], 0.0, 0.0) for number, (x, y) in enumerate(both)]
 

@@ -82,7 +82,6 @@ def messages_alone(
     to: Path,
     topics: str | None = None,
     start_ns: int | None = None,
-    end_ns: int | None = None,
     more: Path | None = None,
 ) -> Path:
     """Copy messages of these topics and times (all by default), as tools do: without metadata and attachments.
@@ -95,9 +94,7 @@ def messages_alone(
         for one in filter(None, (path, more)):
             channels: dict[int, int] = {}
             with one.open("rb") as source:
-                for schema, channel, message in make_reader(source).iter_messages(
-                    topics, starting_at=start_ns, ending_before=end_ns
-                ):
+                for schema, channel, message in make_reader(source).iter_messages(topics, starting_at=start_ns):
                     if schema is not None and channel.id not in channels:
                         kind = writer.register_schema(schema.name, schema.encoding, schema.data)
                         channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)

@@ -24,10 +24,10 @@ def make_posed_contract(**changes) -> Contract:
     return make_contract(**({"batch": ANY_BATCH, "taps": 7, "takes_poses": True, "reach_mm": 10.0} | changes))
 
 
-def posed_pattern(window: np.ndarray, poses: np.ndarray, scale: int = 10) -> np.ndarray:
+def posed_pattern(window: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Return the model's pattern for a window (taps, 3, rows, cols) and its poses (taps, 5)."""
     z = sum(tap[2] * (1 + pose @ WEIGHTS) for tap, pose in zip(window, poses, strict=True))
-    return np.kron(z, np.ones((scale, scale)))
+    return np.kron(z, np.ones((10, 10)))
 
 
 def write_posed_model(path: Path, contract: Contract | None = None) -> Path:

@@ -67,16 +67,16 @@ class Pushed:
         return [event.kind for event in self.events]
 
 
-def pumped(link, *sinks, model=None, runtime=None, statistics=None, rate_hz=None, **how):
+def pumped(link, *sinks, runtime=None, statistics=None, rate_hz=None, **how):
     """Pump a link through a runtime of sensors 4 and 6 into sinks until it ends, and return the statistics."""
     baselines = {name: Baseline.of(name, BASELINE.counts, 1000.0, 100, "file") for name in "46"}
-    runtime = runtime or make_runtime(model, source=link.kind, baselines=baselines)
+    runtime = runtime or make_runtime(source=link.kind, baselines=baselines)
     statistics = statistics or Statistics()
     with Source(link, rate_hz=rate_hz) as source:
         pump(source, runtime, sinks, statistics, **{"stop": threading.Event()} | how)
     return statistics
 
 
-def presses(numbers, sensor="4"):
+def presses(numbers):
     """Return scans that press a little more each, so that each needs a pattern of its own."""
-    return [make_scan(number, sensor=sensor, press_counts=PRESS + 20 * number) for number in numbers]
+    return [make_scan(number, press_counts=PRESS + 20 * number) for number in numbers]

@@ -38,8 +38,8 @@ while True:
 """
 
 
-def make_result(number=0, *, contract=CONTRACT, press_counts=0, **of_the_scan):
-    runtime = Runtime(FakeModel(contract), source="emulated", baselines={"4": BASELINE}, unix_time_s=lambda: 1012.34)
+def make_result(number=0, *, press_counts=0, **of_the_scan):
+    runtime = Runtime(FakeModel(CONTRACT), source="emulated", baselines={"4": BASELINE}, unix_time_s=lambda: 1012.34)
     return runtime.push(make_scan(number, press_counts=press_counts, **of_the_scan))
 
 

@@ -55,10 +55,9 @@ class Page:
         self.messages = []
         self.press = Press()
 
-    def viewer(self, query="", *, origin=None, **settings):
-        headers = {} if origin is None else {"Origin": origin}
+    def viewer(self, query="", **settings):
         # A viewer that has not read everything does not notice that the server closes.
-        settings = {"compression": None, "additional_headers": headers, "close_timeout": 0.2} | settings
+        settings = {"compression": None, "close_timeout": 0.2} | settings
         return connect(f"ws://127.0.0.1:{self.port}/ws{query}", **settings)
 
     def stranger(self, data=b""):
@@ -73,15 +72,15 @@ class Page:
                 sink.write(result, {"dropped": 0})
 
     @contextmanager
-    def playing(self, shows=None, rate_hz=100.0):
-        """Play results at a rate, from a thread of its own as the loop's.
+    def playing(self, shows=None):
+        """Play a hundred results a second, from a thread of its own as the loop's.
 
         With `shows`, what it returns is shown as of ever later scans; a sensor would not believe one taxel for so long.
         """
         stop = threading.Event()
 
         def loop():
-            while not stop.wait(1 / rate_hz):
+            while not stop.wait(0.01):
                 result = self.press.next()
                 if shows is not None:
                     now, result = result.scan, shows()
@@ -144,17 +143,17 @@ def page():
         yield page
 
 
-def get(page, path="/", **headers):
+def get(page, path="/"):
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=TIMEOUT_S)
     try:
-        connection.request("GET", path, headers=headers)
+        connection.request("GET", path)
         response = connection.getresponse()
         return response.status, dict(response.getheaders()), response.read()
     finally:
         connection.close()
 
 
-def refused_with(page, *arguments, **settings):
-    with pytest.raises(InvalidStatus) as caught, page.viewer(*arguments, **settings):
+def refused_with(page, query=""):
+    with pytest.raises(InvalidStatus) as caught, page.viewer(query):
         pass
     return caught.value.response.status_code

@@ -190,7 +190,7 @@ def test_a_full_disk_is_one_line(data, tmp_path):
     data.save(tmp_path / "data.npz")
     full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))"
     words = ["--data", "data.npz", "--validation", "data.npz", "--network", "small-stsr", "--steps", "1"]
-    command = [sys.executable, "-c", f"{full}; from train.fit import main; main()", "mine", *words]
+    command = [sys.executable, "-B", "-c", f"{full}; from train.fit import main; main()", "mine", *words]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     told = "fit: mine/small-stsr.pt cannot be written: File too large; make room, and the same command continues\n"
     assert (done.returncode, done.stderr) == (1, told)
