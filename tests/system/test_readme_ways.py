@@ -1,6 +1,6 @@
 """README's two commands and six ways, typed literally in a bare clone and empty environments, as a new user does.
 
-They fetch gigabytes: `pytest -m night -s --timeout 0 tests/system/test_readme_ways.py` prints how long each line took.
+They fetch gigabytes: `pytest -m night -s tests/system/test_readme_ways.py` prints how long each line took.
 """
 
 import os
@@ -81,6 +81,7 @@ def _until(lines, at_work: str | None) -> Iterator[str]:
 
 
 @pytest.mark.night
+@pytest.mark.timeout(2 * LONGEST_S)
 def test_what_readme_types_works(tmp_path):
     clone, *lines = typed()
     assert clone == "git clone URL tactile && cd tactile" and len([line for line in lines if "edge-sr" in line]) >= 3
