@@ -108,10 +108,11 @@ class Loop:
         self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
         self._counted_ns, self._troubles, self._counters = 0, (), dict[str, int]()
         self._keeper: GainKeeper | None = None
-        if source.kind != "replay" and source.sensor_file.path is not None:
+        file = source.sensor_file
+        if source.kind != "replay" and file.path is not None:
             from edge.pipeline import gain_keeper
 
-            self._keeper = gain_keeper.GainKeeper(source.sensor_file.path, emulated=source.kind == "emulated")
+            self._keeper = gain_keeper.GainKeeper(file.path, file.mountings, emulated=source.kind == "emulated")
         source.reserve(self)
 
     @property
