@@ -140,7 +140,7 @@ class PoseSink(ListSink):
     [
         ({}, None),
         ({"patient": True}, "of another time than now: add --paced"),
-        ({"states_poses": True}, "its scans are of a recording, which has poses of its own"),
+        ({"states_poses": True}, "a pose is refused: the scans come with poses of their own"),
     ],
 )
 def test_poses_reach_the_sinks_before_the_scans_that_they_serve(of_link, why):
