@@ -230,7 +230,7 @@ def test_chunks_made_to_harm_end_it_and_keep_what_was_before(tmp_path, broken, w
         load_recording(written(tmp_path, broken))
 
 
-def test_a_file_that_others_were_put_behind_says_that_they_are_not_read(tmp_path):
+def test_files_put_behind_the_first_are_not_read_and_noted(tmp_path):
     """As `cat first.mcap second.mcap` leaves it, of which nobody heard that the second half is missing."""
     end = (DataEnd(0), Footer(0, 0, 0), MCAP0_MAGIC)
     path = written(tmp_path, *channel_of(SCAN), message(SCAN, GOOD), *end)

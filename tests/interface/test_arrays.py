@@ -105,7 +105,7 @@ def test_a_baseline_is_made_of_raw_counts_alone(counts):
 
 
 @pytest.mark.parametrize("counts", [COUNTS.tolist(), COUNTS > 0, COUNTS.astype(str), np.ma.masked_greater(COUNTS, 1)])
-def test_a_baseline_is_made_of_an_array_whose_numbers_all_count(counts):
+def test_a_baseline_is_made_of_numbers_that_all_count(counts):
     with pytest.raises(BaselineRefusedError, match=r"^counts of sensor 4: expected an array of numbers without a mask"):
         Baseline.from_counts("4", counts, 99.0)
 

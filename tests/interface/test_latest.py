@@ -139,7 +139,7 @@ def test_read_waits_for_a_result_that_is_new():
 
 
 @pytest.mark.parametrize("way", ["read", "read_async"])
-def test_read_passes_over_what_a_loop_had_made_before_the_newest_scans_came(way):
+def test_read_passes_over_what_a_loop_had_made_and_left(way):
     """The robot moved meanwhile; and once the source is closed nothing that was left is new."""
     link = StagedLink(scans(*range(3)), scans(3, 4), endless=True)
 

@@ -111,7 +111,7 @@ class TestIntake:
         assert step(200, pose(1)) == ([], [], 3)
         assert "poses_trouble" in [kind for kind, *_ in step(100 + REPEATED_NS, pose(2))[1]], "after a while again"
 
-    def test_poses_of_a_clock_that_is_ahead_are_used_and_that_is_said(self, step):
+    def test_poses_of_a_clock_that_is_ahead_are_used_and_noted(self, step):
         """Each scan has the pose of a scan that came so much earlier."""
         assert step(NOW_NS, pose(NOW_NS + 50_000_000)) == ([NOW_NS + 50_000_000], [], 0)
         taken, ((kind, _, text),), refused = step(NOW_NS + 1, pose(NOW_NS + 900_000_001))
