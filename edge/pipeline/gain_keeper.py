@@ -23,10 +23,8 @@ class GainKeeper:
 
     def keep(self, sensor: str, learned: Pad) -> None:
         """Begin to write the learned gains of a sensor, which must not wait."""
-        mounting = self._mountings.get(sensor, Mounting())
-        self._written = self._writer.submit(
-            keep_learned, self._path, sensor, learned, mounting, emulated=self._emulated
-        )
+        learning = self._path, sensor, learned, self._mountings.get(sensor, Mounting())
+        self._written = self._writer.submit(keep_learned, *learning, emulated=self._emulated)
 
     def close(self) -> str | None:
         """Wait until all is written, and return why the last gains could not be kept; None if they were."""

@@ -17,9 +17,7 @@ from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.sensor_file.model import PARTS, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines
 
-FRESH_S: Final = 600.0
-"""Age of a baseline, in [s], up to which a pad rests near it: a taxel of the public recordings moved by 60 counts an
-hour."""
+FRESH_S: Final = 600.0  # age of a baseline, in [s], up to which a pad rests near it: it moves by 60 counts an hour
 
 
 def unmapped(pad: SensorGeometry) -> str | ModelMap:
