@@ -116,13 +116,8 @@ def stored_baselines(
 def of_single_csv(baselines: Mapping[str, Baseline], played: str) -> Mapping[str, Baseline]:
     """Return a single baseline under the name of the single CSV that is played, which states no sensor."""
     file = played.removeprefix("replay:")
-    if (
-        not isinstance(baselines, Mapping)
-        or len(baselines) != 1
-        or file == played
-        or "," in file
-        or not file.lower().endswith(".csv")
-    ):
+    single = file != played and "," not in file and file.lower().endswith(".csv")
+    if not (single and isinstance(baselines, Mapping) and len(baselines) == 1):
         return baselines
     sensor = harmless(Path(file).stem, kept="")  # as the reader of the file names it
     (baseline,) = baselines.values()
