@@ -8,7 +8,7 @@ point p of the newest tap's pattern lies at R(t)^T (p - c) in that of an earlier
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, fields, replace
-from math import cos, hypot, radians, sin
+from math import cos, hypot, inf, radians, sin
 from typing import Final
 
 PLACE_ERROR_MM: Final = 0.2
@@ -86,7 +86,7 @@ class PoseTrack:
 
         False, and nothing is added, if one at the same time or later was added before.
         """
-        if self._times_ns and time_ns <= self._times_ns[-1]:
+        if not time_ns > (self._times_ns[-1] if self._times_ns else -inf):  # nor where it is NaN
             return False
         self._times_ns.append(time_ns)
         self._poses.append((pose, holds))

@@ -1,10 +1,12 @@
 """Keeping of learned gains in the sensor file, in a thread of its own: a disk may take longer than a scan."""
 
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 from firmware_bridge.errors import SensorFileError
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
@@ -13,15 +15,16 @@ from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 class GainKeeper:
     """Keeper of the gains that the sensors of one file have learned."""
 
-    def __init__(self, path: Path, *, emulated: bool) -> None:
-        """Prepare to keep gains in a sensor file; emulated sensors leave that of a real one alone."""
-        self._path, self._emulated = path, emulated
+    def __init__(self, path: Path, mountings: Mapping[str, Mounting], *, emulated: bool) -> None:
+        """Prepare to keep gains, learned with these mountings; emulated sensors leave a real one's file alone."""
+        self._path, self._mountings, self._emulated = path, mountings, emulated
         self._writer = ThreadPoolExecutor(1, "gain-keeper")
         self._written: Future[None] | None = None
 
     def keep(self, sensor: str, learned: Pad) -> None:
         """Begin to write the learned gains of a sensor, which must not wait."""
-        self._written = self._writer.submit(keep_learned, self._path, sensor, learned, emulated=self._emulated)
+        learning = self._path, sensor, learned, self._mountings.get(sensor, Mounting())
+        self._written = self._writer.submit(keep_learned, *learning, emulated=self._emulated)
 
     def close(self) -> str | None:
         """Wait until all is written, and return why the last gains could not be kept; None if they were."""
@@ -34,17 +37,22 @@ class GainKeeper:
         return None
 
 
-def keep_learned(path: Path, sensor: str, learned: Pad, *, emulated: bool = False) -> None:
-    """Write learned gains into a sensor file, unless it holds surer ones.
+def keep_learned(
+    path: Path, sensor: str, learned: Pad, mounting: Mounting | None = None, *, emulated: bool = False
+) -> None:
+    """Write gains, learned with a mounting, into a sensor file, unless it holds surer ones.
 
     The file is read again first, since a person or the doctor may have changed it meanwhile.
 
     Raises:
-        SensorFileError: the file cannot be read or written.
+        SensorFileError: the file cannot be read or written, or states another mounting now, by which each gain would be
+            another taxel's, or another axis's.
     """
     with changing(path):
         file = load_sensor_file(path)
         entry = file.sensors.get(sensor, SensorEntry(assumed=frozenset({"mounting"})))
+        if mounting not in (None, entry.mounting):
+            raise SensorFileError(f"{path}: the mounting of sensor {sensor} was changed after they were learned")
         before = entry.learned
         surer = before is not None and before.gains_certainty > learned.gains_certainty
         if surer or (emulated and not entry.emulated):

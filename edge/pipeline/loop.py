@@ -98,8 +98,8 @@ class Loop:
         self._length_ns = math.inf if duration_s is None else duration_s * NS_PER_S
         self._begun_ns: int | None = None
         unused_by = None if any(sink.uses_poses for sink in self._sinks) else runtime.unposed
-        why = "of another time than now: add --paced" if source.patient else "which has poses of its own"
-        refused = f"its scans are of a recording, {why}" if source.patient or source.states_poses else None
+        refused = "its scans are of a recording, of another time than now: add --paced" if source.patient else None
+        refused = "the scans come with poses of their own" if source.states_poses else refused
         self._intake = PoseIntake(runtime, self._poses, refused=refused, unused_by=unused_by)
         self._cadences = Cadences(runtime.expected, recorded=source.kind == "replay", rate_hz=source.rate_hz)
         self._first_ns: int | None = None
@@ -108,10 +108,11 @@ class Loop:
         self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
         self._counted_ns, self._troubles, self._counters = 0, (), dict[str, int]()
         self._keeper: GainKeeper | None = None
-        if source.kind != "replay" and source.sensor_file.path is not None:
+        file = source.sensor_file
+        if source.kind != "replay" and file.path is not None:
             from edge.pipeline import gain_keeper
 
-            self._keeper = gain_keeper.GainKeeper(source.sensor_file.path, emulated=source.kind == "emulated")
+            self._keeper = gain_keeper.GainKeeper(file.path, file.mountings, emulated=source.kind == "emulated")
         source.reserve(self)
 
     @property

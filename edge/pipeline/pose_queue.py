@@ -11,7 +11,7 @@ from edge.inference.bundled import POSED_MODEL
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.validation import as_float, check_kind
-from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose, TimedPose
+from firmware_bridge.poses import AHEAD_NS, PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose, TimedPose
 from firmware_bridge.scans.scan import is_sensor_name
 from firmware_bridge.schedule import SENSOR_SILENT_NS
 
@@ -201,6 +201,10 @@ class PoseIntake:
             for _ in waiting:
                 self._queue.refuse(PoseError("recorded", self._refused))
             waiting = []
+        ahead_ns = max((timed.time_ns for timed in waiting), default=0) - now_ns
+        if ahead_ns > AHEAD_NS:
+            text = f"poses come {ahead_ns / 1e9:.2f} s before the time that they state, and older ones serve until then"
+            self._queue.warn("ahead", f"{text}: is it by CLOCK_MONOTONIC of this machine?")
         taken: list[TimedPose] = []
         for timed in (*recorded, *waiting):
             if timed.sensor is not None and (why := no_sensor(timed.sensor)) is not None:

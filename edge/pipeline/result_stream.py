@@ -185,6 +185,7 @@ class Stream(Loop):
         """Yield how long to wait for a scan, in [s], again and again until a sensor has a new result."""
         check_positive("timeout_s", timeout_s)
         end_ns = self._clock_ns() + timeout_s * NS_PER_S
+        yield 0.0  # a result that an iteration has made and not returned is old by what has come since
         while not self._unseen.get(self._named(sensor), 0):
             self.check_sensor(sensor)
             left_s = (end_ns - self._clock_ns()) / NS_PER_S
@@ -252,15 +253,17 @@ class Stream(Loop):
                 self._source.wait(wait_s)  # not within a step, which another task would have to wait for
             self._step(0.0)
 
+        if self._error is not None:
+            self._step(0.0)  # it raises it: a closed stream has no thread left
         if self._worker is None:
             self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="result-stream")
         await asyncio.get_running_loop().run_in_executor(self._worker, wait_and_step)
 
     def close(self) -> None:
         """End the stream, as closing its source does; its sinks, which may be closed by now, get nothing more."""
+        super().close()
         if self._worker is not None:
             self._worker.shutdown()
-        super().close()
 
 
 class Together(tuple[Result, ...]):

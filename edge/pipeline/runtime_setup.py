@@ -116,7 +116,7 @@ def infer(
     Raises:
         UsageError: counts are not whole; an array is of another shape, or out of range; the rate is.
         ModelError: as in `open_runtime`.
-        RecordingError: counts are readings over a baseline, cut off at 0.
+        RecordingError: counts are readings over a baseline, cut off at 0, or absent on some axes of a taxel.
     """
     from firmware_bridge.links.replay import ReplayLink
 
@@ -137,7 +137,12 @@ def infer(
 
 def _checked(name: str, counts: Any, *, lowest: int) -> NDArray[Any]:
     """Return counts as (n, 3, rows, cols); those in the vendor's order have the axes of each taxel together."""
-    array = np.asarray(counts)
+    try:
+        array = np.asarray(counts)
+    except ValueError as error:
+        raise UsageError(f"{name} are no array of numbers: {error}") from error
+    if np.ma.is_masked(counts):
+        raise UsageError(f"{name} are masked in part, expected an array without a mask: -1 where there is no reading")
     if array.dtype.kind not in "iuf" or array.dtype == np.float16:  # which holds counts to within 32
         raise UsageError(f"{name} are of type {array.dtype}, expected whole numbers: raw counts, nothing subtracted")
     if not np.isfinite(array).all():

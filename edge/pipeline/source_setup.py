@@ -1,8 +1,10 @@
 """Settings of the sensors, from a sensor file and the options next to it."""
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 from edge.errors import UsageError
 from edge.inference.bundled import demo_recording
@@ -14,6 +16,8 @@ from firmware_bridge.pad_geometry import PADS, SensorGeometry
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.sensor_file.model import PARTS, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines
+
+FRESH_S: Final = 600.0  # age of a baseline, in [s], up to which a pad rests near it: it moves by 60 counts an hour
 
 
 def unmapped(pad: SensorGeometry) -> str | ModelMap:
@@ -94,22 +98,26 @@ def refuse_emulated(sensor_file: SensorFile, kind: SourceKind, origin: SourceKin
 def stored_baselines(
     baselines: Mapping[str, Baseline] | str | Path | None, sensor_file: SensorFile
 ) -> Mapping[str, Baseline]:
-    """Return the baselines of free pads: stored ones, or their file, before those of the sensor file."""
+    """Return the baselines of free pads: stored ones, or their file, before those of the sensor file.
+
+    One that a program has kept for FRESH_S, or of an unknown date, is as old as one of a file: it is in doubt as well.
+    """
     if isinstance(baselines, (str, Path)):
         return load_baselines(baselines, sensor_file.orders)
-    return sensor_file.baselines if baselines is None else baselines
+    if not isinstance(baselines, Mapping):  # which is refused where the runtime is made
+        return sensor_file.baselines if baselines is None else baselines
+    now_s = time.time()
+    return {
+        name: replace(one, origin="file") if isinstance(one, Baseline) and not one.age_s(now_s) < FRESH_S else one
+        for name, one in baselines.items()
+    }
 
 
 def of_single_csv(baselines: Mapping[str, Baseline], played: str) -> Mapping[str, Baseline]:
     """Return a single baseline under the name of the single CSV that is played, which states no sensor."""
     file = played.removeprefix("replay:")
-    if (
-        not isinstance(baselines, Mapping)
-        or len(baselines) != 1
-        or file == played
-        or "," in file
-        or not file.lower().endswith(".csv")
-    ):
+    single = file != played and "," not in file and file.lower().endswith(".csv")
+    if not (single and isinstance(baselines, Mapping) and len(baselines) == 1):
         return baselines
     sensor = harmless(Path(file).stem, kept="")  # as the reader of the file names it
     (baseline,) = baselines.values()

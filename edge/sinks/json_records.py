@@ -265,6 +265,12 @@ def _open(target: str) -> FileIO:
             file.seek(0)
             if file.read(len(_BEGINNING)) not in (b"", _BEGINNING):
                 raise OSError(errno.EEXIST, "it holds something else: give another name, or delete it first")
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:  # its records would go, and those of both be mixed
+                raise OSError(error.errno, "another run writes to it: end that, or give another name") from error
+            except OSError:  # a file system without locks
+                pass
         return file
     descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)  # a blocking open would wait for a reader
     os.set_blocking(descriptor, True)

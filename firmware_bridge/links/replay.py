@@ -159,12 +159,16 @@ class ReplayLink(Link):
 
     def _has_pose_times(self, recording: Recording, rate_hz: float | None) -> bool:
         """Return False, and note it, where the times of a recording's poses do not hold."""
-        if recording.poses_by_row or (rate_hz is None and _first_ns(recording) is not None):
+        first_ns, poses, why = _first_ns(recording), recording.poses, "--rate-hz replaces the times"
+        if recording.poses_by_row:
             return True
-        left_out = (
-            f"{recording.path}: its {len(recording.poses)} poses are left out, since --rate-hz replaces the times"
-        )
-        self.notes.append(left_out)
+        if rate_hz is None and first_ns is not None:
+            newest_ns = max(pose.time_ns if pose.used_from_ns is None else first_ns for pose in poses)
+            since_s = (first_ns - newest_ns) / NS_PER_S
+            if since_s < 3600:
+                return True
+            why = f"the last is of {since_s:.4g} s before the first scan, as by another clock"
+        self.notes.append(f"{recording.path}: its {len(poses)} poses are left out, since {why}")
         return False
 
     def _posed(self, recording: Recording) -> Iterator[tuple[int, TimedPose]]:

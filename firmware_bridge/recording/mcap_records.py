@@ -88,6 +88,8 @@ def _undivided(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
         if length > size_bytes - at - _RECORD.size:
             raise CutOffError(f"within a record, at byte {at}")
         if opcode == Opcode.DATA_END:
+            file.seek(length, os.SEEK_CUR)
+            _check_alone(file, size_bytes)
             return
         if opcode not in (Opcode.CHUNK, Opcode.MESSAGE, *_KINDS):
             file.seek(length, os.SEEK_CUR)
@@ -103,6 +105,17 @@ def _undivided(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
         except _BROKEN as error:
             raise DamageError(f"at byte {at}, a chunk that cannot be unpacked: {short(error)}") from error
         yield from _records_of(unpacked, at)
+
+
+def _check_alone(file: BinaryIO, size_bytes: int) -> None:
+    """Raise a DamageError where another file follows, as after `cat`; an index between them may be cut off."""
+    while len(head := file.read(_RECORD.size)) == _RECORD.size:
+        opcode, length = _RECORD.unpack(head)
+        end = file.tell() + length + len(MCAP0_MAGIC)
+        if opcode == Opcode.FOOTER and end < size_bytes:
+            file.seek(end)
+            raise DamageError(f"another file follows at byte {end}")
+        file.seek(min(file.tell() + length, size_bytes))
 
 
 def _records_of(chunk: bytes, at: int) -> Iterator[tuple[int, memoryview]]:

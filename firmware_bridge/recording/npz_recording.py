@@ -30,6 +30,7 @@ from firmware_bridge.recording.tracks import (
     MOST_SENSORS,
     Recording,
     Track,
+    check_raw,
     checked_pose,
     is_rate,
     origin_of,
@@ -148,9 +149,7 @@ def _recording(path: Path) -> Recording:
     if counts.min() < ABSENT or counts.max() > HIGHEST_COUNT:
         got = f"counts {counts.min()}..{counts.max()}"
         _refuse("counts", got, f"0..{HIGHEST_COUNT}, or {ABSENT} where a taxel is absent")
-    absent = counts == ABSENT
-    if (absent.any(axis=1) != absent.all(axis=1)).any():
-        _refuse("counts", "a taxel absent on some axes", "all of a taxel's axes absent or none")
+    check_raw(f"{path}: array 'counts'", counts)
     rate, origin = arrays.get("rate_hz"), arrays.get("origin", arrays.get("source", np.empty(0)))
     if rate is not None and (rate.shape or rate.dtype.kind not in "iuf" or not is_rate(float(rate))):
         _refuse("rate_hz", str(rate)[:40], A_RATE)

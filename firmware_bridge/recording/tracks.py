@@ -13,7 +13,7 @@ from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.pad_geometry import SensorGeometry, pad_of
 from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.scan import VendorReading, is_sensor_name
+from firmware_bridge.scans.scan import ABSENT, VendorReading, is_sensor_name
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -143,11 +143,15 @@ def read_mounting(text: str, taxel_count: int) -> Mounting:
 
 
 def check_raw(name: object, counts: NDArray[Any]) -> None:
-    """Raise a RecordingError where counts (n, 3, rows, cols) are readings over a baseline that were cut off at 0.
+    """Raise a RecordingError where counts (n, 3, rows, cols) are absent on some axes, or over a baseline, cut off at 0.
 
     Raw ones are far from 0; those of a broken chip are 0 on all its axes. Of eight grips that were cut off, a reading
-    in two was 0 on one axis and not on another, and their patterns look right.
+    in two was 0 on one axis and not on another, and their patterns look right. A taxel is taken for one that gave a
+    reading where x is there.
     """
+    absent = counts == ABSENT
+    if (absent.any(axis=1) != absent.all(axis=1)).any():
+        raise RecordingError(f"{name}: a taxel absent on some axes, expected all of a taxel's axes absent or none")
     zero = counts == 0
     share = float((zero.any(axis=1) & ~zero.all(axis=1)).mean())
     if share > 0.2:  # three taxels of sixteen

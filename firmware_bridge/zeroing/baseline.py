@@ -83,8 +83,10 @@ class Baseline:
         """Return the median of scans (n, 3, rows, cols), n > 0, whole ones, of a pad that was free and still.
 
         Raises:
-            BaselineRefusedError: they are of another shape, or a count is beyond 0..65535, as of an absent taxel.
+            BaselineRefusedError: they are no such array, or a count is beyond 0..65535, as of an absent taxel.
         """
+        if not isinstance(counts, np.ndarray) or counts.dtype.kind not in "iuf" or np.ma.is_masked(counts):
+            raise BaselineRefusedError(f"counts of sensor {sensor}: expected an array of numbers without a mask")
         if counts.ndim != 4 or not counts.size or not 0 <= counts.min() <= counts.max() < COUNTS_ON_CIRCLE:
             got = f"shape {counts.shape}, {counts.min():g} to {counts.max():g}" if counts.size else "none"
             expected = f"(n, 3, rows, cols), 0 to {COUNTS_ON_CIRCLE - 1}, nothing subtracted"

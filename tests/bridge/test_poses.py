@@ -174,6 +174,20 @@ def test_poses_of_another_program_are_interpolated_in_time(tmp_path):
         assert x_mm == pytest.approx(time_ns / 1e9 * 20)
 
 
+@pytest.mark.parametrize(("ago_s", "kept"), [(60, True), (50_000, False)])
+def test_poses_of_another_clock_hold_for_no_scan(tmp_path, ago_s, kept):
+    """As of microseconds beside nanoseconds: the last one, which holds, would be the pose of every scan."""
+    with np.load(write_npz(tmp_path / "bare.npz", [3000] * 5)) as arrays:
+        times_ns = arrays["time_ns"] + 100_000 * 10**9
+        poses = {"pose_time_ns": times_ns - ago_s * 10**9, "pose": np.zeros((5, 5)), "pose_holds": np.ones(5, bool)}
+        np.savez(tmp_path / "other.npz", **{**arrays, "time_ns": times_ns}, **poses)
+    with api.open_recording(tmp_path / "other.npz") as source:
+        runtime, events = Runtime(PosedModel(), source="replay", baselines={"4": BASELINE}), []
+        posed = [result.pose is not None for result in Stream(source, runtime, on_event=events.append)]
+    assert posed == [kept] * 5
+    assert any("its 5 poses are left out, since the last is of 5e+04 s" in event.text for event in events) is not kept
+
+
 def test_a_paced_replay_moves_the_poses_with_the_scans(tmp_path):
     clock = iter([70 * 10**9, *[77 * 10**9] * 9]).__next__
     with ReplayLink([record(tmp_path / "posed.mcap")], clock=clock, sleep=lambda time_s: None) as link:

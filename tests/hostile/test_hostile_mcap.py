@@ -9,7 +9,7 @@ import pytest
 import zstandard
 from edge_samples import FakeModel, make_contract
 from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, Chunk, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from mcap_samples import OFFSET_NS
 
@@ -228,3 +228,15 @@ def test_chunks_made_to_harm_end_it_and_keep_what_was_before(tmp_path, broken, w
         assert 0 < left < behind
     with pytest.raises(RecordingError, match=words):
         load_recording(written(tmp_path, broken))
+
+
+def test_files_put_behind_the_first_are_not_read_and_noted(tmp_path):
+    """As `cat first.mcap second.mcap` leaves it, of which nobody heard that the second half is missing."""
+    end = (DataEnd(0), Footer(0, 0, 0), MCAP0_MAGIC)
+    path = written(tmp_path, *channel_of(SCAN), message(SCAN, GOOD), *end)
+    alone = path.read_bytes()
+    assert not any("not read" in note for note in load_recording(path).notes)
+    path.write_bytes(alone * 2)
+    note = load_recording(path).notes[0]
+    size = f"{len(alone):,}"
+    assert note.endswith(f"(another file follows at byte {len(alone)}): {size} bytes after that are not read")

@@ -8,7 +8,17 @@ import pytest
 from cli_samples import write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_scan
 
-from edge.api import Baseline, BaselineRefusedError, Stream, UsageError, infer, open_recording, open_runtime, paired
+from edge.api import (
+    Baseline,
+    BaselineRefusedError,
+    RecordingError,
+    Stream,
+    UsageError,
+    infer,
+    open_recording,
+    open_runtime,
+    paired,
+)
 
 PRESSES = [0] * 5 + [3000] * 5 + [0] * 5
 COUNTS = np.stack([make_scan(number, press_counts=press, noise=3).counts for number, press in enumerate(PRESSES)])
@@ -74,6 +84,9 @@ def test_arrays_of_floats_and_in_the_vendors_order_are_taken(counts, baseline):
         ({"baseline": np.full((3, 4, 4), -1)}, "counts of the baseline are -1 to -1, expected 0 to 65535"),
         ({"baseline": REST[:, :2]}, r"baseline of sensor array has shape \(3, 2, 4\), expected \(3, 4, 4\)"),
         ({"rate_hz": 0}, "rate_hz is 0, expected a positive number"),
+        ({"counts": np.ma.masked_greater(COUNTS, 37_500)}, "counts are masked in part, .*: -1 where there is no"),
+        ({"baseline": np.ma.masked_greater(REST, 33_000)}, "counts of the baseline are masked in part"),
+        ({"counts": [[1], [2, 3]]}, "counts are no array of numbers: "),
     ],
 )
 def test_an_array_of_something_else_is_refused(wrong, words):
@@ -89,6 +102,21 @@ def test_a_baseline_is_made_of_raw_counts_alone(counts):
         BaselineRefusedError, match=r"^counts of sensor 4: .*, expected \(n, 3, rows, cols\), 0 to 65535"
     ):
         Baseline.from_counts("4", counts, 99.0)
+
+
+@pytest.mark.parametrize("counts", [COUNTS.tolist(), COUNTS > 0, COUNTS.astype(str), np.ma.masked_greater(COUNTS, 1)])
+def test_a_baseline_is_made_of_numbers_that_all_count(counts):
+    with pytest.raises(BaselineRefusedError, match=r"^counts of sensor 4: expected an array of numbers without a mask"):
+        Baseline.from_counts("4", counts, 99.0)
+
+
+@pytest.mark.parametrize("axes", [[2], [0, 1]])
+def test_a_taxel_that_is_absent_on_some_axes_is_refused(axes):
+    """Where x alone tells whether it is there, a summed z of nothing reads as a free pad."""
+    counts = COUNTS[7].copy()
+    counts[axes, 1, 1] = -1
+    with pytest.raises(RecordingError, match=r"^counts: a taxel absent on some axes, expected all of"):
+        infer(FakeModel(), counts, REST)
 
 
 class Timed:

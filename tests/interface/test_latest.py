@@ -138,6 +138,25 @@ def test_read_waits_for_a_result_that_is_new():
             stream.read(timeout_s=0)
 
 
+@pytest.mark.parametrize("way", ["read", "read_async"])
+def test_read_passes_over_what_a_loop_had_made_and_left(way):
+    """The robot moved meanwhile; and once the source is closed nothing that was left is new."""
+    link = StagedLink(scans(*range(3)), scans(3, 4), endless=True)
+
+    def read():
+        return stream.read() if way == "read" else asyncio.run(stream.read_async())
+
+    with Source(link) as source:
+        stream = stream_of(source)
+        link.let(0)
+        assert next(iter(stream)).scan.number == 0  # 1 and 2 are made with it
+        link.let(1)
+        latest = read()
+        assert (latest.result.scan.number, latest.new, latest.skipped) == (4, True, 3)
+    with pytest.raises(UsageError, match="closed: results that were left are old"):
+        read()
+
+
 def test_a_loop_and_the_newest_share_one_stream():
     link = StagedLink(scans(0, 1, 2, 3), scans(4), scans(5, 6), endless=True)
     with Source(link) as source:

@@ -111,6 +111,13 @@ class TestIntake:
         assert step(200, pose(1)) == ([], [], 3)
         assert "poses_trouble" in [kind for kind, *_ in step(100 + REPEATED_NS, pose(2))[1]], "after a while again"
 
+    def test_poses_of_a_clock_that_is_ahead_are_used_and_noted(self, step):
+        """Each scan has the pose of a scan that came so much earlier."""
+        assert step(NOW_NS, pose(NOW_NS + 50_000_000)) == ([NOW_NS + 50_000_000], [], 0)
+        taken, ((kind, _, text),), refused = step(NOW_NS + 1, pose(NOW_NS + 900_000_001))
+        assert (taken, kind, refused) == ([NOW_NS + 900_000_001], "poses_trouble", 0)
+        assert text.startswith("poses come 0.90 s before the time that they state") and "CLOCK_MONOTONIC" in text
+
     def test_a_silent_source_is_reported_once_and_when_it_is_back(self, step):
         assert step(10**12)[1] == [], "without any pose there is nothing to miss"
         step(0, pose(1), pose(2, sensor="4"), pose(1, sensor="6", holds=True))
@@ -140,7 +147,7 @@ class PoseSink(ListSink):
     [
         ({}, None),
         ({"patient": True}, "of another time than now: add --paced"),
-        ({"states_poses": True}, "its scans are of a recording, which has poses of its own"),
+        ({"states_poses": True}, "a pose is refused: the scans come with poses of their own"),
     ],
 )
 def test_poses_reach_the_sinks_before_the_scans_that_they_serve(of_link, why):

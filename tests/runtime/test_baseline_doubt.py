@@ -1,16 +1,18 @@
 """Drift, warming and old baselines, which look like a touch, are no contact; what begins as a touch is one."""
 
 import itertools
+import math
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from bridge_samples import REAL_RECORDINGS
-from edge_samples import BASELINE, PERIOD_NS, FakeModel
+from edge_samples import BASELINE, PERIOD_NS, REST, FakeLink, FakeModel
 from runtime_samples import Pushed, make_runtime
 from trust_samples import make_trusted_contract
 
-from edge.api import USPA44, Baseline
+from edge.api import USPA44, Baseline, Source, Stream, open_runtime
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
@@ -236,3 +238,16 @@ class TestRealGrips:
         assert states(forwards[:release]) == {"contact"} and states(forwards[release + 5 :]) == {"idle"}
         backwards = self.played(counts[::-1], rest)[::-1]
         assert states(backwards[:release]) == {"contact"} and states(backwards[release + 5 :]) == {"idle"}
+
+
+@pytest.mark.parametrize(
+    ("age_s", "state"), [(1.0, "contact"), (5 * 3600.0, "baseline_in_doubt"), (math.nan, "baseline_in_doubt")]
+)
+def test_a_baseline_that_a_program_has_kept_is_stored_as_well(age_s, state):
+    """It was taken by this very program, but nobody has seen since that the pad rests near it."""
+    baseline = Baseline.from_counts("4", np.stack([REST.astype(int)] * 9), time.time() - age_s)
+    series = ScanSeries("4", USPA44)
+    scans = [series.close((REST + GRIP).astype(np.int32) + number, number * PERIOD_NS) for number in range(5)]
+    with Source(FakeLink([[scan] for scan in scans])) as source:
+        *_, last = Stream(source, open_runtime(FakeModel(), source, baselines={"4": baseline}))
+    assert last.state == state

@@ -248,7 +248,7 @@ class TestKeeping:
         return path
 
     def test_two_runs_that_learn_into_one_file_lose_nothing(self, file):
-        keepers = [GainKeeper(file, emulated=False) for _ in range(2)]
+        keepers = [GainKeeper(file, {}, emulated=False) for _ in range(2)]
         for number in range(12):
             keepers[number % 2].keep(str(number), LEARNED)
         for keeper in keepers:
@@ -278,20 +278,25 @@ class TestKeeping:
         assert cli.main(["doctor", "--forget-gains", "4"]) == 2
         assert "add --sensor FILE" in capsys.readouterr().err
 
-    @pytest.mark.parametrize("kind", ["device", "emulated", "replay", "file gone"])
+    @pytest.mark.parametrize("kind", ["device", "emulated", "replay", "file gone", "turned by hand"])
     def test_a_stream_keeps_what_its_runtime_learns_of_a_device(self, file, kind):
-        gone, events = kind == "file gone", []
-        link = FakeLink([[scan] for scan in scans_of(draw_contacts(60, draw_gains()))], kind="device" if gone else kind)
+        changed = {"file gone": "cannot be read", "turned by hand": "the mounting of sensor 4 was"}.get(kind)
+        events = []
+        scans = scans_of(draw_contacts(60, draw_gains()))
+        link = FakeLink([[scan] for scan in scans], kind="device" if changed else kind)
         link.patient = True  # else newer scans overtake contacts, and those get no pattern
         with Source(link, sensor_file=load_sensor_file(file)) as source:
             runtime = make_runtime(FakeModel(make_pad_contract(taps=1)), contacts=MODEL, source=source.kind)
-            if gone:
+            if kind == "file gone":
                 file.unlink()
+            elif kind == "turned by hand":
+                file.write_text(file.read_text().replace("swap_xy = false", "swap_xy = true"))
             last = list(Stream(source, runtime, on_event=events.append))[-1]
         assert last.gains_certainty is not None and last.gains_certainty > 0.1
-        if gone:
+        if changed:
             assert [event.kind for event in events] == ["note"]
-            assert "learned gains are not kept: " in events[0].text and "cannot be read" in events[0].text
+            assert "learned gains are not kept: " in events[0].text and changed in events[0].text
+            assert not file.exists() or "learned" not in file.read_text()
             return
         learned = load_sensor_file(file).sensors["4"].learned
         assert (learned is not None) == (kind == "device")

@@ -1,5 +1,6 @@
 """Model that takes poses, in the runtime and alone: which taps a pattern is made from, and where to touch next."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -90,6 +91,11 @@ class TestChoice:
         pad.runtime.pose(PadPose(1, 0), 1 * PERIOD_NS)
         pad.runtime.pose(PadPose(3, 0), 3 * PERIOD_NS)
         assert pad.tap(PadPose(5, 0)).poses[:, 0].tolist() == [0, 2 - 5]
+
+    def test_a_pose_of_no_time_is_refused(self):
+        runtime = make_pad().runtime
+        times_ns = (math.nan, 5, math.nan, 4, 6)  # as of a table with gaps
+        assert [runtime.pose(PadPose(0, 0), time_ns) for time_ns in times_ns] == [False, True, False, False, True]
 
     def test_a_tap_beyond_reach_is_left_out_until_the_pad_comes_near(self):
         pad = make_pad(make_posed_contract(reach_mm=5.0))

@@ -45,6 +45,18 @@ class TestJsonLines:
         open_sink(f"jsonl:{path}", CONTRACT, fake_source()).close()
         assert path.read_text() == '{"time_ns":5,"sensor":"old"}\n'
 
+    def test_a_second_run_leaves_the_records_of_the_first(self, tmp_path):
+        """It emptied the file, and the records of both were mixed from there on."""
+        path, runtime = tmp_path / "out.jsonl", Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+        first = open_sink(f"jsonl:{path}", CONTRACT, fake_source())
+        first.write(runtime.push(make_scan(0)), RUN)
+        with pytest.raises(SinkError, match=r"out\.jsonl: another run writes to it: end that, or give another name"):
+            open_sink(f"jsonl:{path}", CONTRACT, fake_source())
+        first.write(runtime.push(make_scan(1)), RUN)
+        first.close()
+        assert [json.loads(line)["scan"] for line in path.read_text().splitlines()] == [0, 1]
+        open_sink(f"jsonl:{path}", CONTRACT, fake_source()).close()
+
     @pytest.mark.parametrize("content", [b"txl1_x,txl1_y\n", b'{\n  "format": "tactile-baseline"', b"\x89MCAP", b"{"])
     def test_what_holds_no_records_is_not_replaced(self, tmp_path, content):
         """As of `edge-sr replay press.csv --sink jsonl:press.csv`, which left no recording."""
