@@ -81,7 +81,7 @@ def ball_pads(path: Path, diameter_mm: float, file: SensorFile) -> dict[str, tup
             name = next(iter(file.sensors))  # a CSV does not state its sensor
         entry = file.sensors.get(name, SensorEntry())
         presses = recorded_presses(recording, entry, track.sensor)
-        recording = replace(recording, notes=())  # told with the first track
+        recording = replace(recording, notes=())  # which were printed with the first track
         if not presses and len(recording.tracks) > 1:
             continue  # the other finger
         if entry.counts_per_newton is None or entry.counts_per_newton_interval is None:

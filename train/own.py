@@ -227,7 +227,7 @@ def compared(
         if TAPPED not in sets and what != UNLIKE and losing[what] > MOST_LOSING:  # taps show which pad it is
             objections.append(
                 f"on {what} it is below {bundled.name} on {losing[what]:.0%} of the pads that this may be, expected at "
-                f"most {MOST_LOSING:.0%}" + ": learn from its own taps, by train.taps" * bool(knowledge.pad.constants)
+                f"most {MOST_LOSING:.0%}" + ": train on taps of the sensor (train.taps)" * bool(knowledge.pad.constants)
             )
     holes = {name: np.array([_holes(grip, model, knowledge.pad) for grip in grips]) for name, model in models.items()}
     for name, shares in holes.items() if grips else ():

@@ -107,9 +107,9 @@ def _rows(
         alone = alone if rows else found
         row: Row = head | {"model": model.name, "taps": taps, "PSNR dB": with_interval(found, each)}
         row["over one tap"] = with_interval(found - alone, each) if rows else None
-        for least_db in (0, 1):
+        for text, least_db in (("worse than one tap %", 0), ("by over 1 dB %", 1)):
             worse = 100 * float((found < alone - least_db).mean())
-            row[f"worse by {least_db} dB %"] = round(worse) if rows else None
+            row[text] = round(worse) if rows else None
         rows.append(row | {"run time us": run_time_us})
     return rows
 
