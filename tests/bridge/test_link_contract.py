@@ -179,6 +179,17 @@ def test_the_same_frames_make_the_same_scans(rig):
 
 
 @of(CAN)
+def test_a_scan_comes_with_its_last_frame(rig):
+    with rig.link() as link:
+        assert rig.read(link, frames_of(1)[:15]) == [] == link.read(0.0)
+        speaker = threading.Timer(0.02, rig.hear, frames_of(1)[15:])
+        speaker.start()
+        (scan,) = read_scans(link, 1)
+        speaker.join()
+        assert scan.complete
+
+
+@of(CAN)
 def test_half_a_scan_is_forgotten_with_the_link(rig):
     link, frames = rig.link(), frames_of(3)
     for _ in range(2):

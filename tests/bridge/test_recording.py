@@ -41,6 +41,17 @@ def write_two(folder: Path, **changes: object) -> Path:
     return write_npz(folder / "finger.npz", COUNTS, **arrays)
 
 
+def test_csv(tmp_path):
+    path = write_csv(tmp_path, HEADER + row(0) + row(7))
+    recording = load_recording(str(path))
+    assert recording.path == path and recording.rate_hz is None
+    (track,) = recording.tracks
+    assert track.sensor == "finger" and track.time_ns is None and track.mean_rate_hz is None
+    assert track.counts.dtype == np.int32 and track.counts.shape == (2, 3, 4, 4)
+    taxels = np.arange(16).reshape(4, 4) * 100
+    assert (track.counts[1] == np.stack([taxels + 7, taxels + 5007, taxels + 9007])).all()
+
+
 def test_csv_rate_comes_from_the_file_beside_it(tmp_path):
     path = write_csv(tmp_path, HEADER + row(0))
     for text, rate_hz in (("dropped,notes,frequency_hz\n0,,59.75\n", 59.75), ("dropped,notes\n0,\n", None)):

@@ -44,6 +44,19 @@ def test_axes_and_places():
 @pytest.mark.parametrize(
     "changes",
     [
+        {"integer": [7] * 48},
+        {"data": VALUES, "integer": None},
+        {"data": ",".join(f"{value:x}" for value in VALUES) + ",", "integer": None},
+    ],
+)
+def test_every_form_of_the_counts(changes):
+    reading, counters = only_reading(sensor_entry(**changes))
+    assert (reading.counts.reshape(3, 4, 4) == REST_COUNTS).all() and counters == {}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
         *({"data": data} for data in (None, "", "8000," * 47, "8000," * 49, [[0] * 3] * 16, {"0": 1}, 12)),
         *(
             {"data": ",".join(["8000"] * 47 + [last])}
@@ -348,3 +361,14 @@ def test_when_it_was_acquired_unless_that_cannot_be(age_ms):
     (scan,) = [*server.say(0), *server.say(10, cycle(1), age_ms=age_ms)][1:]
     expected_ns = age_ms * MS if 0 < age_ms < 1000 else None
     assert (scan.device_ns and scan.time_ns - scan.device_ns) == (expected_ns and pytest.approx(expected_ns, abs=2000))
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0, 0.05, -0.05])
+def test_a_step_of_the_servers_clock_does_not_hurt(step_s):
+    server = Server()
+    for step in range(20):
+        server.say(10 * step, cycle(step))
+    server.clock_s += step_s
+    scans = [scan for step in range(20, 60) for scan in server.say(10 * step, cycle(step))]
+    assert len(scans) == 40
+    assert all(scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns <= 51 * MS for scan in scans)

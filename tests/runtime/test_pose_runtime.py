@@ -11,7 +11,7 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
 
 from edge.api import USPA44, PadPose, UsageError
-from edge.inference.contract import scheduled_rows
+from edge.inference.contract import pose_rows, scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.taps import next_shift_mm
@@ -50,6 +50,18 @@ class TestChoice:
         assert result.taps_used == 2 and result.poses[:, 0].tolist() == [0, -1]
         pad.tap(PadPose(2, 0))
         assert pad.kinds == ["tap_without_pose"] * 2
+
+    def test_a_pattern_is_made_from_all_taps_with_their_poses(self, session):
+        pad = Pushed(make_runtime(session))
+        for count, pose in enumerate(POSES, 1):
+            result = pad.tap(pose, PRESS + 500 * count)
+            assert result.taps_used == count and result.pose == pose
+            np.testing.assert_allclose(result.poses, pose_rows(POSES[:count][::-1]), rtol=1e-6)
+            peaks = [PRESS + 500 * (one + 1) for one in range(count)][::-1]
+            assert result.window[:, 2].max(axis=(1, 2)).tolist() == peaks
+            np.testing.assert_allclose(result.pattern, expected(result, session.contract), atol=1e-4)
+        assert pad.kinds == [] and result.poses.dtype == np.float32
+        assert result.poses[1, 3] == pytest.approx(np.hypot(0.1, 0.3)), "both poses may be wrong"
 
     def test_a_tap_has_the_pose_of_its_peak(self):
         pad = make_pad()
@@ -172,6 +184,19 @@ class TestChoice:
 
 
 class TestChecks:
+    def test_the_check_of_earlier_taps_takes_their_poses(self):
+        pad = make_pad(make_checked_contract(make_posed_trust(2.5)))
+        pad.tap(PadPose(4, 0))
+        lose_pose(pad)
+        pad.tap()  # without a pose, so it is left out below
+        pad.tap(PadPose(2, 0))
+        result = pad.tap(PadPose(0, 0))
+        assert [share >= 0.5 for share in result.tap_mismatch] == [False, True]
+        assert result.taps_used == 2 and result.poses[:, 0].tolist() == [0, 2] and len(result.window) == 2
+        result = pad.tap(PadPose(4, 0))
+        assert result.poses[:, 0].tolist() == [0, -4, -2], "the first tap is forgotten, the others are not"
+        assert pad.kinds == ["tap_without_pose", "tap_dropped"]
+
     def test_a_posed_tap_that_does_not_belong_goes_alone(self):
         model = PosedModel(make_checked_contract(make_posed_trust(2.5)))
         pad = Pushed(make_runtime(model))

@@ -18,6 +18,25 @@ SURE = make_contract(interval_factor=1.6)
 
 
 class TestResult:
+    def test_a_contact_gives_a_pattern_and_all_that_is_known(self):
+        clock = iter([5_000, 25_500])
+        runtime = make_runtime(clock_ns=lambda: next(clock), counts_per_newton=1200.0)
+        scan = make_scan(3, press_counts=PRESS)
+        result = runtime.push(scan)
+        assert result.scan is scan
+        assert (result.source, result.model, result.state) == ("device", "fake", "contact")
+        assert result.contact is True and result.taps_used == 1
+        expected = np.kron(np.eye(16)[5].reshape(4, 4) * PRESS / 1000, np.ones((10, 10)))
+        np.testing.assert_allclose(result.pattern, expected)
+        assert result.pattern_unit == "mm"
+        assert result.force_counts == PRESS and result.force_n == 2.5
+        assert result.run_time_us == 20.5
+        assert result.area_mm2 == pytest.approx(4.7**2)
+        assert result.centroid_mm == pytest.approx((-2.35, -2.35))
+        assert result.baseline is BASELINE and result.baseline_age_s == 60.0
+        assert result.note == "not checked: the model has no checks"
+        assert result.deviation is result.interval_mm is None, "the model gives none"
+
     def test_where_nothing_is_touched_no_interval_is_told(self):
         contract = dataclasses.replace(SURE, counts_per_unit=(500.0, 500.0, -1000.0))
         result = Pushed(make_runtime(FakeModel(contract))).push(PRESS)

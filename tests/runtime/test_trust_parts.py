@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from edge_samples import write_model
 from trust_samples import CONSTANTS, make_forward, make_trust, make_trusted_contract
 
 from edge.api import Contract, ModelError
 from edge.inference import trust_model as networks
+from edge.inference.onnx_session import ModelSession
 from edge.inference.trust_model import (
     GRID,
     KPA,
@@ -78,6 +80,15 @@ DAMAGE = {
 
 
 class TestTrust:
+    def test_it_comes_back_from_a_model_file(self, tmp_path):
+        made = make_trust()
+        again = ModelSession(write_model(tmp_path / "checks.onnx", make_trusted_contract())).contract.read_trust()
+        row = np.linspace(-1, 1, 104, dtype=np.float32)
+        assert again.tap.network(row[None]) == made.tap.network(row[None]) and again.tap.limit == made.tap.limit
+        assert again.contact.network(row[None, :54]) == made.contact.network(row[None, :54])
+        for name in ("operator", "noise", "model_error"):
+            assert np.array_equal(getattr(again.forward, name), getattr(made.forward, name))
+
     @pytest.mark.parametrize("damage", DAMAGE)
     def test_damage_is_told_in_a_line_that_names_the_key(self, damage):
         contract = replace(make_trusted_contract(), trust=changed(DAMAGE[damage]))

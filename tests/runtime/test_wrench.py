@@ -44,6 +44,18 @@ def test_any_traction_gives_the_sums_over_its_pixels(height, width, pixel_mm, se
     np.testing.assert_allclose(wrench.torque_n_mm, torque, atol=1e-10 * pixel_mm**3)
 
 
+def test_a_pure_twist_has_no_force_and_is_clockwise_from_above():
+    """Shear k kPa/mm times the distance, square to it: k * 2 * integral of x^2, less what pixels leave of it."""
+    at = (np.arange(PIXELS) - 3.5) * CELL_MM
+    traction = np.zeros((3, PIXELS, PIXELS))
+    traction[0], traction[1] = -2 * at[:, None], 2 * at[None, :]  # to the right of the middle it pulls down the rows
+    twist = 2 * 2 * (4 * PITCH_MM) ** 4 / 12 * (1 - 1 / PIXELS**2) / 1000
+    wrench = wrench_of(traction, CELL_MM)
+    assert wrench.force_n == pytest.approx((0, 0, 0), abs=1e-9)
+    assert wrench.torque_n_mm == pytest.approx((0, 0, twist))
+    assert wrench.centre_of_pressure_mm is None
+
+
 @pytest.mark.parametrize(("share", "told"), [(0.99, False), (1.01, True), (-5, False)])
 def test_of_a_light_touch_no_centre_is_told(share, told):
     wrench = wrench_of(even(z=share * LEAST_FORCE_N * 1000 / AREA_MM2), CELL_MM)

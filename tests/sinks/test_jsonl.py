@@ -66,15 +66,33 @@ class TestJsonLines:
             open_sink(f"jsonl:{path}", CONTRACT, fake_source())
         assert path.read_bytes() == content
 
+    @pytest.mark.parametrize(
+        ("chosen", "more"),
+        [
+            ("force_counts", {"force_counts"}),
+            ("deviation, pattern", {"deviation", "pattern"}),
+            ("trusted,temperature_k", set()),  # a field that is left out where it is unknown
+        ],
+    )
+    def test_a_record_holds_named_fields_and_what_a_robot_must_see(self, chosen, more, tmp_path):
+        whole, path = make_sure_results()[6], tmp_path / "out.jsonl"
+        sink = open_sink(f"jsonl:{path}", CONTRACT, fake_source(), fields=chosen)
+        sink.write(whole, RUN)
+        sink.close()
+        record, expected = json.loads(path.read_bytes()), json.loads(record_line(whole, RUN | {"unwritten": 0}))
+        assert whole.pattern is not None and {"source", "state", "trusted", "note", "pattern_unit"} < record.keys()
+        assert record.keys() == {*ALWAYS, "counters", *more}
+        assert record == {name: expected[name] for name in record}
+
     def test_separate_contacts_are_in_a_record_where_they_are_named(self, tmp_path):
         pattern = np.zeros((40, 40), dtype=np.float32)
         pattern[4:10, 4:14], pattern[25:35, 25:35] = 0.2, 0.4
         results = [replace(make_sure_results()[6], pattern=pattern, trusted=True), make_sure_results()[0]]
-        with closing(open_sink(f"jsonl:{tmp_path}/out", CONTRACT, fake_source(), fields="contacts, force_n")) as sink:
+        with closing(open_sink(f"jsonl:{tmp_path}/out", CONTRACT, fake_source(), fields="contacts")) as sink:
             for result in results:
                 sink.write(result, RUN)
         touched, free = map(json.loads, (tmp_path / "out").read_bytes().splitlines())
-        assert free["contacts"] == [] and touched.keys() == {*ALWAYS, "counters", "contacts", "force_n"}
+        assert free["contacts"] == [] and touched.keys() == {*ALWAYS, "counters", "contacts"}
         strong, weak = touched["contacts"]
         assert strong["area_mm2"] == pytest.approx(100 * 0.47**2, abs=1e-3) and weak["long_axis_deg"] == 0
         assert strong["centre_mm"] == pytest.approx([10 * 0.47, 10 * 0.47], abs=1e-3)
