@@ -6,8 +6,8 @@ With `torchrun --nproc-per-node 2 -m train.fit` two processes share each batch.
 
 The bundled networks are trained for as many steps, that of one tap and that of several taps, so that taps alone tell
 them apart. Older taps and the pads' constants are dropped at random in training, so that a network works with fewer
-taps than it takes and without constants. An interrupted run resumes with the same command.
-`tensorboard --logdir checkpoints/logs` shows its progress.
+taps than it takes and without constants. An interrupted run resumes with the same command. NAME.json, next to the
+weights, has the loss by steps.
 """
 
 import argparse

@@ -70,7 +70,6 @@ LEFT_OUT = {
     r"python examples/(print_force|stop_on_area)\.py .*": "goes on until it is ended; test_examples runs them",
     r"python examples/lerobot_camera_tactile_sr/observe\.py .*": "needs LeRobot; test_lerobot runs it",
     r"python examples/train_and_deploy\.py .*": "trains for minutes; test_examples runs it, shortened",
-    r"tensorboard .*": "serves until it is ended, and is not ours",
     r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_page_sensors takes one",
     r"mkdocs build .*": "test_site builds the site",
     r"python tests/docs/field_tables\.py": "writes the pages themselves; test_written_figures compares them",

@@ -16,7 +16,7 @@ _FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTA
 _INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
 _INDENTED = re.compile(r"(?<=\n\n)( {4,7})(?![-*] |\d+\. )\S.*\n(?:(?:\1.*|\n(?=\1))(?:\n|\Z))*")
 _COMMENT = re.compile(r"(?:^|\s)#.*")
-_RUNNABLE = re.compile(r"(?:edge-sr|make|pip install|python3?|sudo|torchrun|tensorboard|git|echo|ros2|ulimit) \S")
+_RUNNABLE = re.compile(r"(?:edge-sr|make|pip install|python3?|sudo|torchrun|git|echo|ros2|ulimit) \S")
 NAMED = re.compile(r"edge-sr ([a-z]+)")
 """A command that is spoken of, not one to be typed."""
 _MAKEFILE = re.compile(

@@ -111,14 +111,13 @@ def fit_network(
     if taps is not None and training.sensor is not None:
         batches = with_own_taps(batches, taps, training.sensor, seed)
     _check_validation(validation, data, net.taps)
-    elapsed_s = train(
+    elapsed_s, course = train(
         net,
         _objective(net, device, seed),
         batches,
         recipe,
         (resume_path := folder / f"{training.name}.resume"),
         identity=f"{training_sha256} {start_sha256}",
-        log_folder=folder / "logs" / training.name,
     )
     net.cpu()
     if training.keep:
@@ -140,6 +139,7 @@ def fit_network(
         "processes": world,
         "threads": torch.get_num_threads(),
         **_evaluated(net, validation),
+        "course": course,
     }
     if rank == 0:
         # The report is written last, so that it never describes weights that do not exist.

@@ -12,7 +12,6 @@ import hashlib
 import io
 import json
 import os
-import sys
 import time
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -24,11 +23,8 @@ from pickle import UnpicklingError
 from typing import Any, Final
 
 import torch
-from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
-from tensorboard.summary.writer.record_writer import RecordWriter
 from torch import distributed, nn
 from torch.nn.parallel import DistributedDataParallel
-from torch.utils.tensorboard.summary import scalar
 
 from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
@@ -138,10 +134,11 @@ def train(
     resume_path: Path,
     *,
     identity: str = "",
-    log_folder: Path | None = None,
     keep_every_s: float = 60.0,
-) -> float:
-    """Train a network in place, leave it in evaluation mode, and return the seconds that all parts of the run took.
+) -> tuple[float, dict[int, float]]:
+    """Train a network in place, and leave it in evaluation mode.
+
+    Returned are the seconds that all parts of the run took, and the loss of a hundred steps by their numbers.
 
     An interrupted run resumes when this is called again with the same `identity`, of network and data, from the state
     in `resume_path`, which the caller deletes when the result is safe. CheckpointError if a batch cannot be shared
@@ -162,8 +159,9 @@ def train(
     wait_for_all()  # the first process to finish may delete the state
     first, kept_s = state["step"], time.monotonic()
     started_s = kept_s - state["elapsed_s"]
-    logged = _Log(resume_path.stem, first, recipe.steps, log_folder if rank == 0 else None)
-    with closing(logged) as log, closing(drawn_ahead(batches, first, recipe.steps)) as drawn:
+    course: dict[int, float] = state["course"]
+    bar = progress(resume_path.stem, recipe.steps, "step", done=first)
+    with bar, closing(drawn_ahead(batches, first, recipe.steps)) as drawn:
         for step, whole in enumerate(drawn, first + 1):
             rate = recipe.learning_rate * learning_rate_share((step - 1) / recipe.steps)
             for group in optimizer.param_groups:
@@ -179,14 +177,17 @@ def train(
                 raise DivergedError(f"{resume_path.stem}: loss {loss} at step {step - 1}: lower the learning rate")
             optimizer.step()
             objective.after_step()
-            log.step(step, loss, rate)
+            bar.update()
+            if step % max(recipe.steps // 100, 1) == 0:
+                course[step] = round(loss, 5)
+                bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
             now_s = time.monotonic()
             if rank == 0 and now_s - kept_s > keep_every_s:
-                facts = {"recipe": recipe_sha256, "step": step, "elapsed_s": now_s - started_s}
+                facts = {"recipe": recipe_sha256, "step": step, "elapsed_s": now_s - started_s, "course": course}
                 _keep(resume_path, parts, facts)
                 kept_s = time.monotonic()
     net.eval()
-    return time.monotonic() - started_s
+    return time.monotonic() - started_s, course
 
 
 def drawn_ahead(batches: Batches, first: int, end: int) -> Generator[Batch, None, None]:
@@ -208,46 +209,10 @@ def _place(net: PatternNet, device: torch.device) -> PatternNet:
     return nn.utils.convert_conv2d_weight_memory_format(net.to(device), torch.channels_last)
 
 
-class _Log:
-    """Progress bar on a terminal, and TensorBoard, whose figures end where the disk is full; the run goes on."""
-
-    def __init__(self, name: str, done: int, steps: int, folder: Path | None) -> None:
-        self._bar = progress(name, steps, "step", done=done)
-        self._file = None
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            # Not SummaryWriter: its thread meets a full disk alone, and prints a traceback.
-            self._file = (folder / f"events.out.tfevents.{time.time_ns()}").open("wb", buffering=0)
-            self._write(Event(file_version="brain.Event:2"))
-
-    def step(self, step: int, loss: float, rate: float) -> None:
-        self._bar.update()
-        if step % 50 == 0:
-            self._bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
-            self._write(Event(step=step, summary=scalar("loss", loss)))
-            self._write(Event(step=step, summary=scalar("learning rate", rate)))
-
-    def _write(self, event: Event) -> None:
-        if self._file is None:
-            return
-        event.wall_time = time.time()
-        try:
-            RecordWriter(self._file).write(event.SerializeToString())
-        except OSError as error:
-            sys.stderr.write(f"{self._file.name}: no further figures: {error.strerror or error}\n")
-            self._file.close()
-            self._file = None
-
-    def close(self) -> None:
-        self._bar.close()
-        if self._file is not None:
-            self._file.close()
-
-
 def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
-    """Return steps and seconds of an interrupted run, whose parts are restored; those of a new run if none."""
+    """Return what is known of an interrupted run, whose parts are restored; that of a new run if none."""
     if not path.exists():
-        return {"step": 0, "elapsed_s": 0.0}
+        return {"step": 0, "elapsed_s": 0.0, "course": {}}
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except DAMAGES as error:
