@@ -97,10 +97,8 @@ def ball_pads(path: Path, diameter_mm: float, file: SensorFile) -> dict[str, tup
             gains=pad.gains,
             gain_half_widths=pad.gain_half_widths,
         )
-        poses = [pose for _, pose in presses if pose is not None]
-        posed = len(poses) == len(presses)
-        told = f"{len(presses)} presses of a ball{' at stated poses' * posed}"
-        pads[name] = told, fit_ball([scans for scans, _ in presses], diameter_mm, known, poses if posed else ())
+        scans = [rising for rising, _ in presses]
+        pads[name] = f"{len(presses)} presses of a ball", fit_ball(scans, diameter_mm, known)
     if not pads:
         raise DatasetError(f"{path} has no press on any sensor: press the ball alone, slowly, all over the pad")
     return pads

@@ -223,9 +223,9 @@ def test_real_recordings_give_each_sensor_its_gains(tmp_path, capsys):
 
 
 class Ball:
-    """A recording of a ball of 40 mm pressed onto a simulated pad, and the pad; with its poses in a `unit` of mm."""
+    """A recording of a ball of 40 mm pressed onto a simulated pad, and the pad."""
 
-    def __init__(self, folder, presses, unit=None):
+    def __init__(self, folder, presses):
         rng = np.random.default_rng(5)
         self.pad = SimulatedPad(thickness_mm=4.0, poisson=0.42, in_plane_share=0.3, shear_modulus_mpa=0.13)
         gripped, at = GrippedPad(self.pad), rng.uniform(-4, 4, (2, presses, 1, 1))
@@ -239,20 +239,12 @@ class Ball:
         free = np.zeros((150, 3, 4, 4))
         scans = np.concatenate([free] + [np.concatenate([one, free]) for one in np.split(done.counts, presses)])
         scans = 30000 + scans + rng.normal(0, 1.5, scans.shape)
-        turn = rng.uniform(-0.5, 0.5, presses)
-        centre = 200 + 50j - np.exp(1j * (turn + 1.2)) * ([1, 1j] @ at.reshape(2, presses))  # mounted as it came
-        rows = np.stack(
-            [centre.real * (unit or 1), centre.imag * (unit or 1), np.degrees(turn), 0.05 + 0 * turn, 1 + 0 * turn]
-        )
-        begun_ns = (150 + (150 + len(course)) * np.arange(presses)) * 10_000_000
-        poses = {"pose_time_ns": begun_ns, "pose": rows.T, "pose_holds": np.ones(presses, bool)}
-        self.path = folder / "ball.npz"
-        write_npz(self.path, scans.round().astype(np.uint16), **({} if unit is None else poses))
+        self.path = write_npz(folder / "ball.npz", scans.round().astype(np.uint16))
 
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
-    return Ball(tmp_path_factory.mktemp("ball"), 6, unit=1.0)
+    return Ball(tmp_path_factory.mktemp("ball"), 6)
 
 
 def weighed(ball, path, pad=None):
@@ -277,14 +269,7 @@ def test_presses_of_a_ball_give_the_constants(ball, tmp_path, capsys):
     for name in ("thickness_mm", "poisson", "in_plane_share"):
         assert abs(getattr(pad, name) - getattr(ball.pad, name)) < 0.15 * np.ptp(RANGES[name]), name
     shown = capsys.readouterr().out
-    assert "4: 6 presses of a ball at stated poses\n" in shown and "entered by hand" in shown
-
-
-def test_poses_that_are_not_of_these_presses_are_one_line(tmp_path):
-    metres = Ball(tmp_path, 6, unit=0.001)
-    out = weighed(metres, tmp_path / "sensor.toml")
-    with pytest.raises(SystemExit, match=r"moves under the pad by .* of what the poses state: expected .* in mm"):
-        identify.main([str(metres.path), "--ball-mm", "40", "--out", str(out)])
+    assert "4: 6 presses of a ball\n" in shown and "entered by hand" in shown
 
 
 @pytest.mark.night

@@ -3,8 +3,7 @@
 Where the shape is known, readings of light and firm presses determine thickness, Poisson's ratio, in-plane share,
 magnet height and free sides; the modulus hardly. The simulated sensor's readings are fitted to those of all presses at
 once, by least squares: unknown are the constants, cross-talk and gains, and of each press its place, depth, drag,
-friction and lag, and what is left of drift. Where a robot states the poses, the places are known to each other, and
-with them the pitch.
+friction and lag, and what is left of drift.
 """
 
 from collections.abc import Sequence
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from firmware_bridge.pad_geometry import AXES, USPA44
-from firmware_bridge.poses import PadPose
 from firmware_bridge.scans.pad_constants import LEVEL_90
 from firmware_bridge.scans.pad_constants import Pad as SensorPad
 from train.errors import DatasetError
@@ -26,9 +24,7 @@ from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances, neighbours
 
 TAXELS: Final = USPA44.taxel_count
 CHANNELS: Final = len(AXES) * TAXELS
-_TURN: Final = len(RANGES)  # number of the pad's turn on its flange, over the first guess of it, in [rad]
-_OF_PAD: Final = len(RANGES) + 3  # its constants, this turn, the cross-talk, and the logarithm of the ball's radius
-_MOST_TURN: Final = 0.8
+_OF_PAD: Final = len(RANGES) + 2  # its constants, the cross-talk, and the logarithm of the ball's radius
 _GAIN_SPREAD: Final = 0.086  # of chips, seats and moments together, one standard deviation
 _MOVES: Final = (1.5, 1.5, 0.5, 0.15, 0.15, 0.5)
 """Deviations of a press about its first guess: x and y in [mm], log of depth, drag in [mm], log of friction."""
@@ -45,44 +41,7 @@ LEAST_SCANS: Final = 12
 MOST_PRESSES: Final = 12  # each takes two seconds or three to fit
 _ENTERED: Final = 0.01  # of its range, how far a constant without an interval may be off
 _OF_PRESS: Final = len(_MOVES) + 1 + len(AXES)
-_LEAST_ERROR_MM: Final = 0.05  # of a place by pose, on a ball that is not quite round
 _Array = NDArray[np.float64]
-
-
-class _StatedPlaces:
-    """Places (2n,) of the ball under the pad in each of n scans, x of all, then y, as far as poses state them, in [mm].
-
-    Where the ball lies in the robot's plane, and where the pad on its flange, poses do not state: it is fitted.
-    """
-
-    def __init__(self, poses: Sequence[PadPose], guess: _Array) -> None:
-        turn = np.exp(-1j * np.radians([pose.turn_deg for pose in poses]))  # x + iy
-        seen = -turn * np.array([complex(pose.x_mm, pose.y_mm) for pose in poses])
-        one, (x, y) = np.ones_like(turn), guess.reshape(2, -1)
-        way = np.linalg.lstsq(np.stack([one, turn, seen], axis=1), x + 1j * y)[0][-1]
-        if not 0.5 < abs(way) < 1.6:
-            raise DatasetError(
-                f"the ball moves under the pad by {abs(way):.2g} of what the poses state: expected the pad's centre in "
-                "mm, x to the right and y down, over a ball that stays where it is"
-            )
-        fitted = np.array([_x_then_y(part) for part in (one, 1j * one, turn, 1j * turn)]).T
-        self._rest = np.eye(len(fitted)) - fitted @ np.linalg.pinv(fitted)
-        self._seen = seen * way / abs(way)
-        self._error_mm = np.tile([max(pose.error_mm, _LEAST_ERROR_MM) for pose in poses], 2)
-        self.nearest = guess - self._rest @ (guess - _x_then_y(self._seen))
-
-    def away(self, places: _Array, turned_rad: float) -> _Array:
-        """Return how far places are from those stated, over their errors, by a pad that is turned on its flange."""
-        return self._rest @ (places - _x_then_y(self._seen * np.exp(1j * turned_rad))) / self._error_mm
-
-    def slopes(self, turned_rad: float) -> tuple[_Array, _Array]:
-        """Return the change of `away` by that of places, (2n, 2n), and of the turn, (2n,)."""
-        by_turn = -self._rest @ _x_then_y(1j * self._seen * np.exp(1j * turned_rad))
-        return self._rest / self._error_mm[:, None], by_turn / self._error_mm
-
-
-def _x_then_y(places: NDArray[np.complexfloating]) -> _Array:
-    return np.concatenate([places.real, places.imag], dtype=np.float64)
 
 
 class _Presses:
@@ -93,13 +52,10 @@ class _Presses:
         presses: Sequence[NDArray[np.floating]],
         diameter_mm: float,
         known: SensorPad,
-        poses: Sequence[PadPose],
     ) -> None:
         radius = np.log(diameter_mm / 2) + _BALL_ERROR * np.array([-LEVEL_90, LEVEL_90])
-        ends = np.array(
-            [_known_ends(known, name) for name in RANGES] + [(-_MOST_TURN, _MOST_TURN), (0, _CROSS_TALK), radius]
-        )
-        told = np.array([name in known.constants for name in RANGES] + [False, False, True])
+        ends = np.array([_known_ends(known, name) for name in RANGES] + [(0, _CROSS_TALK), radius])
+        told = np.array([name in known.constants for name in RANGES] + [False, True])
         self.middle = ends.mean(axis=1)
         # A constant is normal within a measured interval, and else uniform within its range.
         self.spread = np.ptp(ends, axis=1) / np.where(told, 2 * LEVEL_90, np.sqrt(12))
@@ -111,7 +67,7 @@ class _Presses:
         here = np.zeros((len(depths), len(_MOVES)))
         here[:, 2] = np.log(depths)
         sums = self._readings(self.middle, here)[:, -TAXELS:].sum(axis=1)
-        self.counts, of = _light(presses, 0.9 * float(sums[-1]))
+        self.counts = _light(presses, 0.9 * float(sums[-1]))
         z = np.abs(self.counts[:, -TAXELS:])
         clipped = np.abs(self.counts) > 0.97 * np.repeat(LARGEST_COUNTS, TAXELS)
         self.error = np.where(clipped, np.inf, np.hypot(_NOISE_COUNTS, _MODEL_ERROR * np.tile(z, len(AXES))))
@@ -120,9 +76,6 @@ class _Presses:
         self._begin[:, :2] = np.square(z) / np.square(z).sum(axis=1, keepdims=True) @ USPA44.taxel_centres_mm()
         self._begin[:, 2] = np.log(np.interp(z.sum(axis=1), sums, depths))
         self._begin[:, 5] = np.log(0.6)
-        self._places = _StatedPlaces([poses[press] for press in of], self._begin[:, :2].T.ravel()) if poses else None
-        if self._places is not None:
-            self._begin[:, :2] = self._places.nearest.reshape(2, -1).T
 
     def _readings(self, of_pad: _Array, presses: _Array) -> _Array:
         """Return readings (n, CHANNELS) of a pad without gains of its own."""
@@ -157,8 +110,7 @@ class _Presses:
         constants, gains, moves, rest = self.parts(unknown)
         read = self._readings(constants, moves)
         model = read * (1 + _FACTOR * rest[:, :1]) * gains + np.repeat(rest[:, 1:] * _LEFT_COUNTS, TAXELS, axis=1)
-        away = [] if self._places is None else [self._places.away(moves[:, :2].T.ravel(), constants[_TURN])]
-        return np.concatenate([((model - self.counts) / self.error).ravel(), *away, unknown])
+        return np.concatenate([((model - self.counts) / self.error).ravel(), unknown])
 
     def slopes(self, unknown: _Array) -> _Array:
         """Return the Jacobian of `residuals`: of the simulation by differences, else exact."""
@@ -190,36 +142,29 @@ class _Presses:
             own = slice(axis * TAXELS, (axis + 1) * TAXELS)
             for row in rows:
                 slopes[row, own, first + row * _OF_PRESS + len(_MOVES) + 1 + axis] = left
-        away = np.zeros((0 if self._places is None else 2 * n, len(unknown)))
-        if self._places is not None:
-            by_place = np.add.outer(range(2), first + rows * _OF_PRESS).ravel()
-            of_places, of_turn = self._places.slopes(constants[_TURN])
-            away[:, by_place] = of_places * np.repeat(_MOVES[:2], n)
-            away[:, _TURN] = of_turn * self.spread[_TURN]
         read = (slopes / self.error[:, :, None]).reshape(n * CHANNELS, -1)
-        return np.concatenate([read, away, np.eye(len(unknown))])
+        return np.concatenate([read, np.eye(len(unknown))])
 
 
-def _light(presses: Sequence[NDArray[np.floating]], most_counts: float) -> tuple[_Array, list[int]]:
-    """Return two scans of each press, (n, CHANNELS), and the number of each one's press.
+def _light(presses: Sequence[NDArray[np.floating]], most_counts: float) -> _Array:
+    """Return two scans of each press, (n, CHANNELS).
 
     They are the strongest below a sum of z, and one of about half of that. DatasetError if there are fewer than
     LEAST_SCANS.
     """
     pairs = []
-    for number, scans in enumerate(presses):
+    for scans in presses:
         sums = scans[:, AXES.index("z")].sum(axis=(1, 2))
         if len(light := np.flatnonzero(sums <= most_counts)):
             half = np.abs(sums - sums[light[-1]] / 2).argmin()
-            pairs.append([(scans[at].ravel(), number) for at in dict.fromkeys((int(half), int(light[-1])))])
+            pairs.append([scans[at].ravel() for at in dict.fromkeys((int(half), int(light[-1])))])
     if (count := sum(map(len, pairs))) < LEAST_SCANS:
         raise DatasetError(
             f"{len(presses)} presses with {count} scans below {most_counts:.0f} counts in the sum of z, expected "
             f"{LEAST_SCANS} or more: press the ball alone, slowly, all over the pad, which is free in between"
         )
     spread = np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PRESSES)).round().astype(int)
-    scans, of = zip(*(pair for at in spread for pair in pairs[at]), strict=True)
-    return np.array(scans, dtype=np.float64), list(of)
+    return np.array([scan for at in spread for scan in pairs[at]], dtype=np.float64)
 
 
 def _known_ends(known: SensorPad, name: str) -> tuple[float, float]:
@@ -230,21 +175,18 @@ def _known_ends(known: SensorPad, name: str) -> tuple[float, float]:
     return known.constants[name] - away, known.constants[name] + away
 
 
-def fit_ball(
-    presses: Sequence[NDArray[np.floating]], diameter_mm: float, known: SensorPad, poses: Sequence[PadPose] = ()
-) -> SensorPad:
+def fit_ball(presses: Sequence[NDArray[np.floating]], diameter_mm: float, known: SensorPad) -> SensorPad:
     """Return those constants of a pad that presses of a ball determine, with 90 % intervals; not counts per newton.
 
     Args:
         presses: scans (n, 3, rows, cols) of each from first touch on, in counts over the pad that was free just before.
         diameter_mm: of the ball, in [mm].
         known: of the sensor; a constant without an interval is as good as certain.
-        poses: of the pad at each press, or none.
 
     Raises:
-        DatasetError: they are too few, no pad that is simulated reads so, or the poses are not of these presses.
+        DatasetError: they are too few, or no pad that is simulated reads so.
     """
-    fit = _Presses(presses, diameter_mm, known, poses)
+    fit = _Presses(presses, diameter_mm, known)
     count = _OF_PAD + CHANNELS + len(fit.counts) * _OF_PRESS
     bound = np.concatenate([fit.bound, np.full(count - _OF_PAD, 4.0)])
     slopes: Any = fit.slopes  # which the types of scipy do not know as a Jacobian
