@@ -46,7 +46,6 @@ REPORT := nice $(BIN)/python
 
 reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each command stands alone, too
 	$(REPORT) -m train.experiments all
-	$(REPORT) -m export.stability
 	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md
 	$(BIN)/edge-sr bench --threads 1 --out reports
 	$(REPORT) tests/support/wire_faults.py --out reports/wire-faults.md

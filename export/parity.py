@@ -1,4 +1,4 @@
-"""Parity between a graph and its network at every optimisation level of onnxruntime, with extreme windows."""
+"""Parity between a graph and its network, on readings and on extreme windows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,15 +26,6 @@ from export.graph import ParityError, outputs
 from train.networks.blocks import PatternNet
 from train.surfaces.poses import ANGLE_STEP_DEG
 
-LEVELS: Final = {
-    "none": onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL,
-    "basic": onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC,
-    "extended": onnxruntime.GraphOptimizationLevel.ORT_ENABLE_EXTENDED,
-    "layout": onnxruntime.GraphOptimizationLevel.ORT_ENABLE_LAYOUT,
-    "all": onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL,
-}
-"""Optimisation levels of onnxruntime by name; each includes the ones before it. The runtime uses the last."""
-
 TOLERANCE: Final = 1e-5
 """Largest accepted difference between torch and a float32 graph on readings, as `Difference.relative`.
 
@@ -61,13 +52,12 @@ class Difference:
 
 
 class GraphRun:
-    """Graph in onnxruntime at one optimisation level, for comparison without a contract and bound arrays."""
+    """Graph in onnxruntime, optimised as in the runtime, for comparison without a contract and bound arrays."""
 
-    def __init__(self, model: onnx.ModelProto, level: str = "all") -> None:
+    def __init__(self, model: onnx.ModelProto) -> None:
         options = onnxruntime.SessionOptions()
         options.log_severity_level = LOG_FATAL_ONLY
         options.intra_op_num_threads = 1
-        options.graph_optimization_level = LEVELS[level]
         self._session = onnxruntime.InferenceSession(
             model.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )

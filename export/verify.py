@@ -2,13 +2,11 @@
 
 python -m export.verify edge/models/*.onnx
 
-Every graph is run at every optimisation level of onnxruntime on the frozen test set, on the real recordings of
-TACTILE_RECORDINGS, if it names a folder of TRIAL/xela_SENSOR.csv, and on extreme windows. float32 graphs are compared
-with torch, int8 graphs with the torch network from which they were quantised, which is restored from the float32 graph.
+Every graph is run on the frozen test set and on extreme windows. float32 graphs are compared with torch, int8 graphs
+with the torch network from which they were quantised, which is restored from the float32 graph.
 """
 
 import argparse
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -29,7 +27,6 @@ from edge.terminal.progress_bar import tracked
 from export.graph import ExportError, ParityError
 from export.parity import (
     EXTREME_TOLERANCE,
-    LEVELS,
     TOLERANCE,
     Difference,
     GraphRun,
@@ -41,27 +38,24 @@ from export.parity import (
 )
 from export.to_onnx import MOST_LOSS_DB
 from firmware_bridge.pad_geometry import AXES
-from train.data.real_grips import recorded_sets
 from train.errors import CheckpointError, ended_by_errors
 from train.learning.checkpoint import network_of, origin_of
 from train.networks.blocks import PatternNet
 from train.report import Report, Row, markdown
 
-_SCANS_APART: Final = 20
 BOUNDS: Final = {"float32": (TOLERANCE, EXTREME_TOLERANCE), "int8": (0.25, 1.05)}
 """Largest relative difference from the network, in any pixel: on readings, and on windows beyond any touch.
 
 Beyond any touch int8 saturates: it is off by the value itself, and the runtime believes no pattern there.
 """
 FROZEN: Final = BUNDLE_DIR / "frozen.npz"
-READINGS: Final = ("test set", "one tap", "recordings")
+READINGS: Final = ("test set", "one tap")
 
 
 class Parity(NamedTuple):
-    """Comparison of one graph at one level on some windows: differences by output, and which bound is broken, or ""."""
+    """Comparison of one graph on some windows: differences by output, and which bound is broken, or ""."""
 
     model: str
-    level: str
     windows: str
     differences: tuple[Difference, ...]
     psnr_change_db: float | None
@@ -72,7 +66,6 @@ class Parity(NamedTuple):
         change = "-" if self.psnr_change_db is None else f"{self.psnr_change_db:+.4f}"
         return {
             "model": self.model,
-            "level": self.level,
             "windows": self.windows,
             "largest": " ".join(f"{one.largest:.1e}" for one in self.differences) or "-",
             "relative": " ".join(f"{one.relative:.1e}" for one in self.differences) or "-",
@@ -81,8 +74,8 @@ class Parity(NamedTuple):
         }
 
 
-def verify(path: Path, frozen: FrozenSet, recordings: Path | None = None) -> Iterator[Parity]:
-    """Compare one model with its network at every level, on every kind of windows.
+def verify(path: Path, frozen: FrozenSet) -> Iterator[Parity]:
+    """Compare one model with its network on every kind of windows.
 
     The network is restored from NAME.onnx, that of NAME-int8.onnx too.
     A model of another scale than the test set's is compared with its network, but not evaluated.
@@ -98,37 +91,19 @@ def verify(path: Path, frozen: FrozenSet, recordings: Path | None = None) -> Ite
     except (ModelError, ExportError, CheckpointError) as error:
         raise type(error)(f"{path}: {error}") from error
     groups: dict[str, NDArray[np.float32]] = {"test set": read_windows(frozen, contract, None)}
-    if recordings is not None:
-        groups["recordings"] = recorded_windows(recordings, contract)
     if contract.takes_poses:
         groups["one tap"] = groups["test set"][:, : len(AXES)]
     groups |= extreme_windows(contract)
-    expected = {name: run_network(net, windows) for name, windows in groups.items()}
     truth = frozen.patterns() if contract.scale == frozen.scale else None
-    for level in tracked(LEVELS, path.stem, "level"):
-        run = GraphRun(model, level)
-        for name, windows in groups.items():
-            found, change_db, broken = (), None, ""
-            try:
-                true = truth if name == "test set" else None
-                found, change_db, broken = judged(name, contract, expected[name], run(windows), true)
-            except ParityError as error:
-                broken = str(error)
-            yield Parity(path.stem, level, name, found, change_db, broken)
-
-
-def recorded_windows(folder: Path, contract: Contract) -> NDArray[np.float32]:
-    """Return windows (n, 3K, rows, cols) of real recordings, in network units: no truth is known of them.
-
-    They are scans under load, with others of their trial as the taps before.
-    """
-    windows = []
-    for scans in recorded_sets(folder):
-        newest = np.arange(0, len(scans.counts), _SCANS_APART)
-        earlier = (newest[:, None] + np.arange(contract.taps) * _SCANS_APART) % len(scans.counts)
-        windows.append(contract.scale_window(scans.counts[earlier].astype(np.float32)))
-    joined = np.concatenate(windows)
-    return joined.reshape(len(joined), -1, contract.rows, contract.cols)
+    run = GraphRun(model)
+    for name, windows in tracked(groups.items(), path.stem, "kind"):
+        found, change_db, broken = (), None, ""
+        try:
+            true = truth if name == "test set" else None
+            found, change_db, broken = judged(name, contract, run_network(net, windows), run(windows), true)
+        except ParityError as error:
+            broken = str(error)
+        yield Parity(path.stem, name, found, change_db, broken)
 
 
 def judged(
@@ -180,9 +155,9 @@ def _load(path: Path) -> onnx.ModelProto:
 
 def worst(rows: Sequence[Parity]) -> list[Parity]:
     """Return all rows of readings; of extreme windows those that break a bound, or else the largest difference."""
-    alike: dict[tuple[str, str, str], list[Parity]] = {}
+    alike: dict[tuple[str, str], list[Parity]] = {}
     for row in rows:
-        alike.setdefault((row.model, row.level, row.windows if row.windows in READINGS else ""), []).append(row)
+        alike.setdefault((row.model, row.windows if row.windows in READINGS else ""), []).append(row)
     return [
         shown
         for same in alike.values()
@@ -197,18 +172,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("models", type=Path, nargs="+", help="NAME.onnx or NAME-int8.onnx")
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the table as a report, too")
     options = parser.parse_args(arguments)
-    recordings = os.environ.get("TACTILE_RECORDINGS")
     with ended_by_errors("verify"):
         out: Path | None = options.out
         report = None if out is None else Report(out.stem, out.parent, __file__, [*options.models, FROZEN])
         frozen = load_frozen_set(FROZEN)
-        folder = Path(recordings) if recordings else None
-        rows = [row for path in options.models for row in verify(path, frozen, folder)]
+        rows = [row for path in options.models for row in verify(path, frozen)]
         table = [row.row() for row in worst(rows)]
         sys.stdout.write(markdown(table) + "\n")
         if report is not None:
-            told = f"With torch {torch.__version__}. Of the extreme windows the worst of each level is shown."
-            report.table(table, told)
+            report.table(table, f"With torch {torch.__version__}. Of the extreme windows the worst is shown.")
             report.write()
     broken = sum(bool(row.broken) for row in rows)
     if broken:
