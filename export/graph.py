@@ -39,7 +39,7 @@ class ParityError(ExportError, ArithmeticError):
 
 _ARGUMENTS: Final = {INPUT_NAME: "window", POSES_NAME: "poses", PAD_NAME: "pad"}
 """Argument of a network's forward for each input of its graph."""
-_TRACED: Final = 2  # windows with which a graph is traced: with one window, the tracer would take the size 1 as fixed
+_TRACED: Final = 2  # windows, or earlier taps, with which a graph is traced: the tracer takes the size 1 as fixed
 
 
 def to_model(net: PatternNet, pad: SensorGeometry = USPA44) -> onnx.ModelProto:
@@ -51,8 +51,9 @@ def to_model(net: PatternNet, pad: SensorGeometry = USPA44) -> onnx.ModelProto:
     free = {0: torch.export.Dim(ANY_BATCH)}
     inputs, dims = {INPUT_NAME: example}, {INPUT_NAME: free}
     if net.takes_poses:
-        inputs[INPUT_NAME] = example.unflatten(1, (net.taps, 3))
-        inputs[POSES_NAME] = torch.zeros(_TRACED, net.taps, POSE_WIDTH)
+        taps = max(net.taps, 1 + _TRACED)
+        inputs[INPUT_NAME] = torch.zeros(_TRACED, taps, 3, pad.rows, pad.cols)
+        inputs[POSES_NAME] = torch.zeros(_TRACED, taps, POSE_WIDTH)
         dims[INPUT_NAME] = dims[POSES_NAME] = free | {1: torch.export.Dim(ANY_TAPS)}
     if net.known:
         inputs[PAD_NAME], dims[PAD_NAME] = torch.zeros(_TRACED, net.known), free

@@ -135,8 +135,7 @@ def export(
             net.add_intervals().contact_level.fill_(contract.contact_level)
         else:
             fit_correction(net, intervals.training, contract.contact_level, steps=intervals.steps)
-        posed, sensor = net.takes_poses, sensor_of(report)
-        readings = readings_of_presses(intervals.validation, net.taps, posed=posed, sensor=sensor)
+        readings = readings_of_presses(intervals.validation, net.taps, sensor=sensor_of(report))
         levels = conform(net, lambda *given: run_network(net, *given), readings)
         contract = replace(contract, interval_levels=levels)
     name, model = checkpoint.stem, to_model(net, pad)
@@ -158,9 +157,8 @@ def export(
     facts = [*judge_in_contract(session, frozen, validation), *facts]
     contract = session.contract
     lost, exceeded = cost(float_error, contract.test_error.get(str(contract.taps), {}))
-    # Several taps are checked by their poses: a model that takes none would be believed whatever they are.
-    checkable = contract.taps == 1 or contract.takes_poses
-    if trust is not None and checkable and contract.pad_inputs and contract.traction_scale:
+    # The paper's networks, several of whose taps would be believed whatever they are, have neither.
+    if trust is not None and contract.pad_inputs and contract.traction_scale:
         contract.trust.update(trust.to_json())
     content = _content(model, contract, origin(report))
     Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime

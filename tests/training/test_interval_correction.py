@@ -18,6 +18,7 @@ from train.learning.interval_fit import (
     readings_of_presses,
 )
 from train.networks.compact import LOG_RANGE, CompactNet
+from train.networks.named_networks import build
 from train.physics.pad_draws import KNOWN
 
 LEVEL = 0.3
@@ -26,7 +27,8 @@ LEVEL = 0.3
 def make_net(taps=2) -> CompactNet:
     """Return first weights whose patterns are not all zeros."""
     torch.manual_seed(0)
-    net = CompactNet(taps, 10, channels=16, blocks=1, known=KNOWN).eval()
+    net = build("compact-stsr" if taps == 1 else f"fusion-mtsr{taps}", 10, channels=16, blocks=1, known=KNOWN).eval()
+    assert isinstance(net, CompactNet)
     with torch.no_grad():
         net.leave[2].bias_free += 0.02
     return net

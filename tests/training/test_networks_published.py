@@ -40,7 +40,7 @@ def test_parameters_and_macs_are_the_published_ones(name):
     ("name", "scale", "said"),
     [
         ("stsr", 0, "at least 1"),
-        ("mtsr8", 10, "no network 'mtsr8', expected one of srcnn, .*compact-mtsr7"),
+        ("mtsr8", 10, "no network 'mtsr8', expected one of srcnn, .*fusion-mtsr7"),
         ("compact-stsr", 5, "even"),
         ("compact-stsr", 0, "even"),
     ],
@@ -67,9 +67,9 @@ def test_a_network_grown_from_another_computes_the_same(start, name, scale):
 
 def test_at_another_scale_a_compact_network_keeps_its_trunk():
     torch.manual_seed(6)
-    old = build("compact-mtsr2", 4, channels=16, blocks=1)
-    net = grown(old, "compact-mtsr2", 10, channels=16, blocks=1)
-    assert net(window(2))[0].shape == (2, 40, 40)
+    old = build("compact-stsr", 4, channels=16, blocks=1)
+    net = grown(old, "compact-stsr", 10, channels=16, blocks=1)
+    assert net(window(1))[0].shape == (2, 40, 40)
     before = write_out(old).state_dict()
     changed = {key for key, value in write_out(net).state_dict().items() if not torch.equal(value, before[key])}
     assert changed == {f"{end}.{part}" for end in ("leave.2", "uncertainty.2") for part in ("weight", "bias")}

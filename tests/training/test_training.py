@@ -27,7 +27,7 @@ from train.physics.pad_draws import KNOWN
 
 SMALL = {"channels": 16, "blocks": 1, "known": KNOWN}
 TRAINING = Training(
-    "small", "compact-mtsr2", Recipe(steps=20, batch=16, learning_rate=5e-3, given=(0.5, 0.5)), options=SMALL
+    "small", "fusion-mtsr2", Recipe(steps=20, batch=16, learning_rate=5e-3, given=(0.5, 0.5)), options=SMALL
 )
 
 
@@ -139,17 +139,17 @@ def test_the_bundled_networks_need_presses_of_seven_taps(data):
 def test_one_network_by_the_command(data, tmp_path, capsys):
     data.save(tmp_path / "data.npz")
     files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / "data.npz")]
-    options = [*files, "--network", "compact-mtsr2", "--steps", "2"]
+    options = [*files, "--network", "fusion-mtsr2", "--steps", "2"]
     main([str(tmp_path), *options, "--bf16"])
-    assert capsys.readouterr().out.startswith("compact-mtsr2: validation ")
-    assert load_network(tmp_path / "compact-mtsr2.pt")[1]["config"]["recipe"]["bf16"] is True
+    assert capsys.readouterr().out.startswith("fusion-mtsr2: validation ")
+    assert load_network(tmp_path / "fusion-mtsr2.pt")[1]["config"]["recipe"]["bf16"] is True
 
 
 @pytest.mark.parametrize(
     ("options", "told"),
     [
         (["--data", "absent.npz"], "no such file"),
-        (["--network", "compact-mtsr4"], "no sequences of 4 taps"),
+        (["--network", "mtsr4"], "no sequences of 4 taps"),
         (["--network", "fusion-mtsr4"], "no sequences of 3 taps"),
         (["--network", "compact-stsr", "--start-from", "absent"], "absent.pt"),
         (["--network", "compact-stsr", "--start-from", "absent", "--keep", "1"], "keep is 1"),
@@ -175,7 +175,7 @@ def test_presses_that_do_not_belong_together_are_refused_first(data, tmp_path):
         "moved": "has 0 sequences of 2 taps that are only turned",
         "coarse": "at x2 of 4 x 4 taxels; expected some of 2 taps, at x10 of 4 x 4",
     }
-    options = ["--network", "compact-mtsr2", "--steps", "1"]
+    options = ["--network", "fusion-mtsr2", "--steps", "1"]
     for name, told in refused.items():
         files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / f"{name}.npz")]
         with pytest.raises(SystemExit, match=rf"^fit: the validation set [^\n]*{told}[^\n]*$"):

@@ -138,7 +138,7 @@ def median_ms(run: Callable[[], object]) -> float:
 def _quick(training: Training) -> Training:
     """Return the training in miniature, under its own name."""
     recipe = replace(training.recipe, steps=1, batch=2)
-    options = {"channels": 16, "blocks": 1} if training.network.startswith("compact") else {}
+    options = {"channels": 16, "blocks": 1} if training.network.startswith(("compact", "fusion")) else {}
     start = training.start and f"quick-{training.start}"
     return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
 

@@ -76,18 +76,17 @@ class Readings:
 
 
 def readings_of_presses(
-    presses: PressSet, taps: int, times: int = 3, *, posed: bool = False, sensor: OneSensor | None = None
+    presses: PressSet, taps: int, times: int = 3, *, sensor: OneSensor | None = None
 ) -> list[Readings]:
     """Return presses as sensors of their own read them, with nothing and with everything known of each sensor.
 
     Of `sensor` is known what its file states, and nothing.
     """
-    presses = presses if posed or taps == 1 else presses.only_turned()
     readings = []
     for number in range(times):
         frozen = freeze_presses(presses, SEED + number, Nuisances() if sensor is None else sensor.nuisances)
         poses = None
-        if posed:
+        if taps > 1:
             poses = stated_poses(np.random.default_rng(SEED + number), presses.with_taps(taps).poses)
         for known in (False, True):
             windows = frozen.windows(taps, gains_known=known and sensor is None)
@@ -167,7 +166,6 @@ def _ratios(
 def _samples(net: CompactNet, correction: IntervalCorrection, presses: PressSet) -> tuple[Tensor, Tensor, Tensor]:
     """Return inputs of the factors (n, ...), taps (n, K - 1), and logarithms of errors over half widths (n, 4, m)."""
     rng = np.random.default_rng(_SEED)
-    presses = presses if net.takes_poses or net.taps == 1 else presses.only_turned()
     whole = presses.with_taps(net.taps)
     usable = np.flatnonzero(whole.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps >= net.taps))
     names = whole.family[usable]

@@ -1,9 +1,9 @@
-"""Compact network: a trunk at twice the taxel grid, enlarged to the pattern by pixel shuffle.
+"""Compact network of one tap: a trunk at twice the taxel grid, enlarged to the pattern by pixel shuffle.
 
-Compared with the paper's network (Wu and Liu 2024, Fig. 8) it keeps the two branches, pattern from all taps and force
-from the newest one, and leaves out the layers at full resolution and batch normalisation, which cost 8 dB after 1000
-steps here. It adds the uncertainty of each pixel, the traction on the pad, and the pad's constants as an input; and it
-is exactly symmetric under quarter turns.
+Compared with the paper's network (Wu and Liu 2024, Fig. 8) it keeps the two branches, of the pattern and of the force,
+and leaves out the layers at full resolution and batch normalisation, which cost 8 dB after 1000 steps here. It adds the
+uncertainty of each pixel, the traction on the pad, and the pad's constants as an input; and it is exactly symmetric
+under quarter turns.
 
 A deviation alone has one bias in the contact and another around it, and one for a contact that covers the pad and
 another for a wire. The correction of intervals multiplies it by one of four factors, by the pixel's region; a small
@@ -128,21 +128,19 @@ _MOST_LOGIT: Final = 8.0
 
 
 class CompactNet(PatternNet):
-    """Network from a window of K taps to a pattern, the standard deviation of each pixel, and the traction on the pad.
+    """Network from a tap to a pattern, the standard deviation of each pixel, and the traction on the pad.
 
-    A tap enters the pattern branch divided by its own amplitude, and the newest tap's amplitude multiplies the
-    result: a flat contact's pattern is nearly linear in its force, so the trunk has to learn shapes only, and no force
-    is out of its range. The amplitude itself enters as a bounded number, for the nonlinear part. An absent tap is all
-    zeros, and stays zero. `known` numbers state constants of the pad, `intervals` corrects the deviations by region as
-    `add_intervals` does. Mirror images are not in `group`: a mirrored pad is turned the other way from tap to tap.
-    ValueError if there are no taps, the scale is odd, or channels do not divide.
+    A tap enters the pattern branch divided by its own amplitude, which multiplies the result: a flat contact's pattern
+    is nearly linear in its force, so the trunk has to learn shapes only, and no force is out of its range. The
+    amplitude itself enters as a bounded number, for the nonlinear part. `known` numbers state constants of the pad,
+    `intervals` corrects the deviations by region as `add_intervals` does. ValueError if the scale is odd, or channels
+    do not divide.
     """
 
     deviation_scale: Tensor  # factor on the deviation, see train.learning.interval_fit.calibrate
 
     def __init__(
         self,
-        taps: int,
         scale: int,
         channels: int,
         blocks: int,
@@ -151,19 +149,16 @@ class CompactNet(PatternNet):
         intervals: bool = False,
     ) -> None:
         super().__init__()
-        if taps < 1:
-            raise ValueError(f"{taps} taps asked for, expected at least 1")
         if scale < 2 or scale % 2:
             raise ValueError(f"scale is {scale}, expected an even number: the trunk works at twice the taxel grid")
-        self.taps, self.scale, self.known = taps, scale, known
+        self.taps, self.scale, self.known = 1, scale, known
         self.group: Group = group
         self._width = (channels, blocks)
         grow = scale // 2
         wide, merged, left = (fields(group, size) for size in (channels, channels * 3 // 2, 2 * channels))
         narrow = fields(group, channels // 2)
         about, pixel = scalars(group, known + 1), scalars(group, 1).shuffled(grow)
-        # Two 3 x 3 convolutions cover nearly all of 4 x 4 taxels, so taps turned against each other are merged here.
-        self.enter = SymmetricConv2d(vectors(group, taps) + about, merged, 3)
+        self.enter = SymmetricConv2d(vectors(group) + about, merged, 3)
         self.merge = nn.Sequential(
             nn.ReLU(),
             SymmetricConv2d(merged, merged, 3),
@@ -211,7 +206,7 @@ class CompactNet(PatternNet):
         Patterns are cut at zero in evaluation but not in training: a sub-pixel that is cut everywhere would never learn
         again. Deviations are always above zero; their loss does not train the features of the pattern.
 
-        Windows are (n, 3K, rows, cols) in network units, constants of the pads (n, known), None for none.
+        Windows are (n, 3, rows, cols) in network units, constants of the pads (n, known), None for none.
         """
         return self.finished(self.see(window, pad))
 
@@ -226,14 +221,10 @@ class CompactNet(PatternNet):
 
     def see(self, window: Tensor, pad: Tensor | None = None) -> "Seen":
         """Return the outputs before any correction, and what they were made of; arguments as `forward`."""
-        count, _, rows, cols = window.shape
-        taps = window.view(count, self.taps, 3, rows, cols)
-        amplitude = tap_amplitude(taps)
-        shapes = (taps / amplitude).view(count, 3 * self.taps, rows, cols)
-        newest = amplitude[:, 0, 0]
-        entered = self.enter_pad(shapes, shapes[:, :3], self.about(newest, pad))
+        amplitude = tap_amplitude(window[:, None])[:, 0]
+        entered = self.enter_pad(window / amplitude, self.about(amplitude[:, 0], pad))
         state = self.trunk(torch.relu(entered.merged * (1 + entered.scale) + entered.shift))
-        return self.leave_pad(state, entered, newest, (amplitude[:, 1:, 0, 0, 0] > QUIET_UNITS).to(window.dtype))
+        return self.leave_pad(state, entered, amplitude[:, 0], entered.about[:, :0])
 
     def about(self, newest: Tensor, pad: Tensor | None) -> Tensor:
         """Return (n, known + 1): what is known of the pad, and a bounded number of an amplitude (n, 1, 1)."""
@@ -242,11 +233,10 @@ class CompactNet(PatternNet):
             return F.pad(size, (self.known, 0))
         return torch.cat([pad, size], dim=1)
 
-    def enter_pad(self, shapes: Tensor, newest: Tensor, about: Tensor) -> "Entered":
-        """Return what enters the trunk, of readings of amplitude 1: all taps' for the pattern, the newest for force."""
-        planes = about[:, :, None, None].expand(-1, -1, *shapes.shape[2:])
-        entered = self.enter(torch.cat([shapes, planes], dim=1))
-        felt = self.force(torch.cat([newest, planes], dim=1))
+    def enter_pad(self, shape: Tensor, about: Tensor) -> "Entered":
+        """Return what enters the trunk, of readings of the newest tap with amplitude 1, (n, 3, rows, cols)."""
+        given = torch.cat([shape, about[:, :, None, None].expand(-1, -1, *shape.shape[2:])], dim=1)
+        entered, felt = self.enter(given), self.force(given)
         everywhere = torch.cat([torch.relu(entered).mean(dim=(2, 3), keepdim=True), about[:, :, None, None]], dim=1)
         scale, shift = self.context(everywhere).chunk(2, dim=1)
         return Entered(self.merge(entered), scale, shift, felt, about)
@@ -264,7 +254,7 @@ class CompactNet(PatternNet):
         return Seen(features, newest, entered.about, later, pattern, deviation, traction)
 
     def take_over(self, start: PatternNet) -> None:
-        """Copy another network's function of the newest taps; further taps are ignored until trained.
+        """Copy another network's function of the newest tap.
 
         From fewer symmetries to more, the asymmetric part is lost. At another scale the output layers are initialised
         again. ValueError if kind, width or inputs of the pad are others.
@@ -281,11 +271,6 @@ class CompactNet(PatternNet):
             source = theirs.get(name)
             if isinstance(ours, SymmetricConv2d) and isinstance(source, SymmetricConv2d):
                 weight = source.weight.detach()
-                if name == "enter":
-                    kept, about = 3 * min(self.taps, start.taps), self.known + 1
-                    widened = torch.zeros_like(ours.weight)
-                    widened[:, :kept], widened[:, -about:] = weight[:, :kept], weight[:, -about:]
-                    weight = widened
                 if weight.shape == ours.weight.shape:
                     ours.assign(weight, source.bias.detach())
         self.deviation_scale.copy_(start.deviation_scale)

@@ -46,7 +46,7 @@ class FusionNet(CompactNet):
     def __init__(self, taps: int, scale: int, *, intervals: bool = False, **shape: Any) -> None:
         if taps < 2:
             raise ValueError(f"{taps} taps asked for, expected at least 2: a network of one tap has nothing to fuse")
-        super().__init__(1, scale, **shape)
+        super().__init__(scale, **shape)
         self.taps, group, channels = taps, self.group, self._width[0]
         wide, merged = fields(group, channels), fields(group, channels * 3 // 2)
         about, pose = scalars(group, self.known + 1), vectors(group) + scalars(group, 4)
@@ -118,7 +118,7 @@ class FusionNet(CompactNet):
         amplitude = tap_amplitude(taps)
         shapes, newest = taps / amplitude, amplitude[:, 0, 0]
         there = (amplitude[:, 1:] > QUIET_UNITS).to(window.dtype)
-        entered = self.enter_pad(shapes[:, 0], shapes[:, 0], self.about(newest, pad))
+        entered = self.enter_pad(shapes[:, 0], self.about(newest, pad))
         if poses is None:
             rows_of_schedule = torch.from_numpy(scheduled_rows(taps.shape[1], ANGLE_STEP_DEG)).to(taps)
             poses = rows_of_schedule.expand(len(taps), -1, -1)

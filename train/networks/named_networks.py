@@ -25,9 +25,9 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     "srcnn": (TactileSRCNN, {}),
     "srgan": (TactileSRGAN, {}),
     **{name: (SeedNet, {"taps": taps}) for name, taps in _TAPS.items()},
-    **{f"compact-{name}": (CompactNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items()},
+    "compact-stsr": (CompactNet, _WIDE),
     **{f"fusion-{name}": (FusionNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items() if taps > 1},
-    "small-stsr": (CompactNet, {"taps": 1, "channels": 32, "blocks": 4}),  # a quarter of the work
+    "small-stsr": (CompactNet, {"channels": 32, "blocks": 4}),  # a quarter of the work
 }
 """Class of each network, and the arguments that options may replace, by name."""
 
@@ -43,8 +43,8 @@ def build(name: str, scale: int, **options: Any) -> PatternNet:
 def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNet:
     """Build a new network that starts from copies of another's weights; CheckpointError if the weights do not fit.
 
-    An MTSR-K can start from an STSR, a compact network from one of any taps, and any from its own kind. At
-    another scale a compact network keeps its trunk, and its output layers are initialised again.
+    A network of several taps can start from one of a single tap, and any from its own kind. At another scale a compact
+    network keeps its trunk, and its output layers are initialised again.
     """
     net = build(name, scale, **options)
     try:
