@@ -92,12 +92,12 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _training(options: argparse.Namespace) -> Training:
     *_, taps = options.network.rpartition("mtsr")
-    recipe = Recipe(options.steps, given=given_taps(int(taps) if taps.isdigit() else 1), bf16=options.bf16)
+    recipe = Recipe(options.steps, given=given_taps(int(taps) if taps.isdigit() else 1), bf16=True)
     compact = options.network.startswith(_COMPACT)
     # A network of the paper must not overwrite a bundled one.
     name = options.network if compact else f"seed-{options.network}"
-    constants, start, keep = _KNOWN if compact else {}, options.start_from, options.keep
-    return Training(name, options.network, recipe, start=start, seed=options.seed, options=constants, keep=keep)
+    constants = _KNOWN if compact else {}
+    return Training(name, options.network, recipe, start=options.start_from, seed=options.seed, options=constants)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -114,11 +114,7 @@ def _parser() -> argparse.ArgumentParser:
         help=", ".join(NETWORKS) + "; those of the paper are seed-NAME.pt",
     )
     alone("--start-from", metavar="NAME", help="checkpoint in the same folder, or bundled NAME.onnx, to start from")
-    alone(
-        "--keep", type=float, default=0.0, metavar="SHARE", help="share of its weights in the final ones (default: 0)"
-    )
     alone("--steps", type=int, default=9000)
-    alone("--bf16", action="store_true", help="multiply in bfloat16")
     alone("--seed", type=int, default=1)
     return parser
 

@@ -23,7 +23,6 @@ COLUMNS = {
     "nonnegative": [{"world", "known", "over one tap", "run time us"}],
     "second-world": [{"method", "sinking, PSNR dB", "as drawn, wrong %"}, {"truth"}, {"sensor, after 10 %"}],
     "blind-sensors": [{"patterns", "figures, over"}, {"sensor", "its own, all", "all families", "handed over"}],
-    "fig5": [{"surface", "beta by search mm"}, {"slope per N"}],
     "fig7": [{"method", "error %", "ms a pattern"}],
 }
 """Some columns of the tables of each experiment that needs no recordings."""

@@ -1,6 +1,6 @@
 """Run experiments: each writes a page NAME.md with its tables.
 
-python -m train.experiments families fig5 --reports reports
+python -m train.experiments families fig7 --reports reports
 """
 
 import argparse
@@ -14,7 +14,6 @@ from edge.terminal.progress_bar import tracked
 from train.errors import ended_by_errors
 from train.experiments.blind_sensors import blind_sensors
 from train.experiments.families import families, pads
-from train.experiments.fig5 import fig5
 from train.experiments.fig7 import fig7
 from train.experiments.nonnegative import nonnegative
 from train.experiments.paper_tables import angle, table3, table4, taps, unseen
@@ -29,7 +28,7 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {
     work.__name__.replace("_", "-"): work
     for work in (
         *(families, pads, trust_checks, posed_taps, nonnegative, real, second_world, blind_sensors, table3, table4),
-        *(angle, taps, unseen, fig5, fig7),
+        *(angle, taps, unseen, fig7),
     )
 }
 """Functions of the experiments by name; the first line of each one's docstring is its help."""

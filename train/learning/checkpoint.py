@@ -3,7 +3,6 @@
 A float32 ONNX graph is read like a checkpoint: it holds its network's weights, and its metadata say which one that is.
 """
 
-import copy
 import hashlib
 import json
 import platform
@@ -49,10 +48,7 @@ ORIGIN_KEY: Final = "tactile.origin"
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """Configuration that determines the weights of a network.
-
-    `keep` brings back what the training forgets of other contacts. Source: Wortsman et al. 2022 (WiSE-FT), Eq. 1.
-    """
+    """Configuration that determines the weights of a network."""
 
     name: str  # of the checkpoint
     network: str  # a name of train.networks.named_networks
@@ -61,14 +57,7 @@ class Training:
     start: str | None = None  # checkpoint whose weights it starts from, or NAME.onnx of a bundled model
     seed: int = 1  # of weights and draws
     options: dict[str, Any] = field(default_factory=dict)  # further arguments of the network's class
-    keep: float = 0.0  # share of the weights it starts from in the final ones
     sensor: OneSensor | None = None  # that it is for, None for any
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.keep < 1:
-            raise CheckpointError(f"keep is {self.keep}, expected a share from 0 to below 1")
-        if self.keep and self.start is None:
-            raise CheckpointError(f"keep is {self.keep}, but there are no weights to start from: give --start-from")
 
     def sha256(self, data_sha256: str) -> str:
         """Return the hash of the configuration and the data, as written in the models' contract."""
@@ -102,7 +91,6 @@ def fit_network(
         if start_path is None
         else grown(load_network(start_path)[0], training.network, training.scale, **training.options)
     )
-    first = copy.deepcopy(net.state_dict()) if training.keep else {}
     rank, world = rank_and_world()
     device = device_of_rank(rank)
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
@@ -120,10 +108,6 @@ def fit_network(
         identity=f"{training_sha256} {start_sha256}",
     )
     net.cpu()
-    if training.keep:
-        net.load_state_dict(
-            {name: weight.lerp(first[name], training.keep) for name, weight in net.state_dict().items()}
-        )
     report = {
         "name": training.name,
         "network": training.network,
