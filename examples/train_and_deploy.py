@@ -1,4 +1,4 @@
-"""Train a network on your own object, and run it: STL, simulated presses, training, ONNX, patterns.
+"""Train a network on your own object: STL, simulated presses, training, and an ONNX model for edge-sr.
 
     pip install -e '.[export]'      # in the checkout, in an environment of its own
     python examples/train_and_deploy.py bolt.stl --out bolt                # the real thing, an hour
@@ -25,7 +25,7 @@ try:
 except ModuleNotFoundError as error:
     sys.exit(f"train_and_deploy: {error}: pip install -e '.[export]' in the checkout")
 
-from edge.api import NoDeviceError, Stream, load_model, open_runtime, open_source
+from edge.api import load_model
 from edge.terminal.argument_types import positive
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.scans.pad_constants import Pad
@@ -77,49 +77,21 @@ def train(mesh: Path, out: Path, *, minutes: float, figures: float, seed: int) -
     return True
 
 
-def deploy(model: Path, source_text: str | None, duration_s: float) -> None:
-    """Run the model, as `edge-sr --model FILE` does; without a source and an adapter, only say how."""
-    then = f"from now on: edge-sr --model {model}"
-    try:
-        source = open_source(*filter(None, [source_text]))
-    except NoDeviceError as error:
-        if source_text is not None:
-            raise
-        print(f"not tried on a sensor: {error}\n{then}")
-        return
-    session = load_model(model)
-    print(f"{session.name}: error on the frozen test set {session.contract.test_error}")
-    patterns = 0
-    with source:
-        for result in Stream(source, open_runtime(session, source), duration_s=duration_s):
-            if result.pattern is not None:
-                patterns += 1
-                print(
-                    f"{result.source} sensor {result.scan.sensor}: pattern {result.pattern.shape} in "
-                    f"{result.pattern_unit}, deepest {result.pattern.max():.2f}, {result.area_mm2:.0f} mm2 touch"
-                )
-    print(f"{patterns} patterns; {then}")
-
-
 def main() -> None:
-    """Train, then run."""
-    parser = argparse.ArgumentParser(description="Train on an object of your own, and run the model.")
+    """Train, and say how to run the model."""
+    parser = argparse.ArgumentParser(description="Train on an object of your own.")
     add = parser.add_argument
     add("mesh", type=Path, help="STL, OBJ or PLY, in millimetres")
     add("--out", type=Path, required=True, help="folder for everything; its name is the model's")
     add("--minutes", type=positive, default=60.0, help="about how long all takes (60)")
     add("--figures", type=float, default=0.0, help="share of the presses that are of random figures (0)")
     add("--seed", type=int, default=1, help="seed of everything random (1)")
-    add("--source", help="source to try it on, as for edge-sr (default: the adapter plugged in, if any)")
-    add("--duration-s", type=positive, default=10, help="seconds to try it (10)")
     options = parser.parse_args()
     with ended_by_errors("train_and_deploy"):
-        if options.source is not None:
-            open_source(options.source)  # a form that does not exist is refused now, not after the training
         out, minutes = options.out, options.minutes
         if not train(options.mesh, out, minutes=minutes, figures=options.figures, seed=options.seed):
             sys.exit(1)
-        deploy(out / f"{out.resolve().name}.onnx", options.source, options.duration_s)
+    print(f"from now on: edge-sr --model {out / out.resolve().name}.onnx")
 
 
 if __name__ == "__main__":
