@@ -28,7 +28,7 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
-from train.data.real_grips import recorded_sets
+from train.data.real_grips import recorded_contacts
 from train.data.recorded_taps import recorded_presses
 from train.errors import DatasetError, ended_by_errors
 from train.learning.ball_fit import fit_ball
@@ -53,9 +53,8 @@ def contact_pads(folder: Path, file: SensorFile) -> dict[str, tuple[str, Pad]]:
 
     DatasetError if there are none, or a recording cannot be read or is not of the file's sensor.
     """
-    model, sets, told = load_contact_model(CONTACTS), recorded_sets(folder, file), {}
-    for sensor in dict.fromkeys(one.sensor for one in sets):
-        counts = np.concatenate([one.counts for one in sets if one.sensor == sensor])
+    model, told = load_contact_model(CONTACTS), {}
+    for sensor, counts in recorded_contacts(folder, file).items():
         if len(dead := np.flatnonzero((np.ptp(counts, axis=0) == 0).all(axis=0))):
             raise DatasetError(
                 f"taxel {dead[0]} (row by row, from 0) of {sensor} reads the same in all contacts, expected a whole "

@@ -13,7 +13,7 @@ from edge.inference.contract import ANY_BATCH
 from edge.inference.onnx_session import ModelSession
 from edge.perception.taxel_health import HOLD_SCANS
 from train.data.frozen_presses import load_frozen_presses
-from train.data.real_grips import has_hole, play, recorded_grips, recorded_sets, share_touched, unevenness
+from train.data.real_grips import has_hole, play, recorded_contacts, recorded_grips, share_touched, unevenness
 from train.errors import CheckpointError, DatasetError
 from train.experiments import trust_checks
 from train.experiments.__main__ import run
@@ -43,21 +43,16 @@ def test_known_gains_and_pads_enter_the_model(tmp_path):
 
 
 def test_recordings_are_zeroed_by_the_trial_that_lets_go(recordings):
-    sets = {(part.sensor, part.trial): part.counts for part in recorded_sets(recordings)}
-    assert set(sets) == {(f"xela_sensor{n}", f"trial-{t}") for n in (1, 2) for t in "ab"}
-    for trial, released in (("trial-a", False), ("trial-b", True)):
-        kept = grip(released)
-        again = np.zeros(len(kept), bool)
-        again[10:30:10] = True
-        if released:
-            again[30:] = True
-        np.testing.assert_array_equal(sets["xela_sensor1", trial], kept[~again])
+    found, again = recorded_contacts(recordings), np.zeros(120, bool)
+    again[10:30:10] = again[70:90:10] = again[90:] = True
+    assert set(found) == {"xela_sensor1", "xela_sensor2"}
+    np.testing.assert_array_equal(found["xela_sensor1"], np.concatenate([grip(False), grip(True)])[~again])
 
 
 def test_a_damaged_recording_is_named(recordings):
     (recordings / "trial-a" / "xela_sensor1.csv").write_text("nothing\n")
     with pytest.raises(DatasetError, match=r"trial-a/xela_sensor1\.csv, line 1"):
-        recorded_sets(recordings)
+        recorded_contacts(recordings)
 
 
 def test_measures_of_a_face_of_half_a_face_and_of_a_hole():

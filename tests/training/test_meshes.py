@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from train.errors import MeshError
-from train.surfaces.meshes import MAX_TRIANGLES, load_mesh
+from train.surfaces.meshes import MAX_FILE_BYTES, load_mesh
 
 BOX_MM = (10.0, 8.0, 3.0)
 AT_REST = [-5, -4, -3, 5, 4, 0]
@@ -159,11 +159,8 @@ def test_an_impossible_size_says_the_size_and_the_unit(tmp_path):
     refused(saved(tmp_path, "unit.stl", binary_stl(box().triangles)), "by --unit-mm 1000, at most 500 mm", unit_mm=1000)
 
 
-def test_a_huge_grid_is_refused_for_its_triangles(tmp_path):
-    faces = np.zeros(MAX_TRIANGLES + 1, dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, [0, 1, 2]
-    head = "ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
-    head += "property float x\nproperty float y\nproperty float z\n"
-    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    content = head.encode() + np.eye(3, dtype="<f4").tobytes() + faces.tobytes()
-    refused(saved(tmp_path, "huge.ply", content), "2000001 triangles; at most 2000000")
+def test_a_huge_file_is_refused_before_it_is_read(tmp_path):
+    path = saved(tmp_path, "huge.stl", b"")
+    with path.open("r+b") as file:
+        file.truncate(MAX_FILE_BYTES + 1)
+    refused(path, "100 MB; at most 100 MB are read: save it as a binary file, or reduce the mesh")

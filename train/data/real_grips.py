@@ -48,15 +48,6 @@ class Grip:
         return np.stack([deformation(scan, self.free, self.mounting) for scan in self.counts])
 
 
-@dataclass(frozen=True, slots=True)
-class ScanSet:
-    """Pressed scans of one sensor in one trial, which are not independent."""
-
-    sensor: str
-    trial: str
-    counts: NDArray[np.float32]  # (n, 3, rows, cols) zeroed
-
-
 def z_of(counts: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return readings of z, (n, taxels), from scans (n, 3, rows, cols)."""
     return counts[:, _Z].reshape(-1, _TAXELS)
@@ -149,20 +140,20 @@ def _placed_counts(path: Path, entry: SensorEntry) -> NDArray[np.integer]:
     return entry.mounting.place_counts(recording.tracks[0].counts)
 
 
-def recorded_sets(folder: Path, known: SensorFile = _UNKNOWN) -> list[ScanSet]:
-    """Return real scans under load, one set for each trial and sensor; repeated scans are left out.
+def recorded_contacts(folder: Path, known: SensorFile = _UNKNOWN) -> dict[str, NDArray[np.float32]]:
+    """Return the scans under load of each sensor, (n, 3, rows, cols) zeroed; repeated scans are left out.
 
     DatasetError as of `recorded_grips`, or if none is under load.
     """
-    sets: list[ScanSet] = []
+    contacts: dict[str, list[NDArray[np.float32]]] = {}
     for grip in recorded_grips(folder, known):
         renewed = np.append(True, (np.diff(grip.counts, axis=0) != 0).any(axis=(1, 2, 3)))
         zeroed = grip.zeroed()[renewed]
-        sets.append(ScanSet(grip.free.sensor, grip.trial, zeroed[loaded(zeroed)]))
-    pressed = [scans for scans in sets if len(scans.counts)]
-    if not pressed:
+        if (pressed := loaded(zeroed)).any():
+            contacts.setdefault(grip.free.sensor, []).append(zeroed[pressed])
+    if not contacts:
         raise DatasetError(f"nothing presses a pad in the recordings of {folder}: expected contacts of many shapes")
-    return pressed
+    return {sensor: np.concatenate(parts) for sensor, parts in contacts.items()}
 
 
 def neighbours_mean(z: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -123,13 +123,6 @@ class ContactSolver:
         indentation = np.broadcast_to(np.asarray(indentation_mm, dtype=np.float64), len(depth_mm))
         if not (indentation > 0).all():
             raise ValueError(f"indentation is {indentation.min()} mm, expected a positive depth")
-        lowest = depth_mm.min(axis=(1, 2))
-        if (lowest >= indentation).any():
-            pose = int(np.argmax(lowest >= indentation))
-            raise ValueError(
-                f"depth image {pose} begins {lowest[pose]:.4g} mm down, pressed in by {indentation[pose]:.4g} mm: no "
-                "cell of the pad is reached; press deeper, or measure depth from first contact"
-            )
         pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
         residual = np.zeros(len(depth_mm), dtype=np.float32)
         for poses, place in self._grid.boxes(depth_mm < REACH * indentation[:, None, None]):

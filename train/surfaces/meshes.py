@@ -14,9 +14,8 @@ from train.errors import MeshError
 MESH: Final = "mesh:"  # beginning of a surface's name that is a user's file
 _UNIT: Final = "?unit_mm="
 SUFFIXES: Final = (".stl", ".obj", ".ply")
-MAX_TRIANGLES: Final = 2_000_000
-MAX_FILE_BYTES: Final = 400_000_000
-"""Largest file read: two million triangles in the most verbose OBJ. A longer one would fill the memory first."""
+MAX_FILE_BYTES: Final = 100_000_000
+"""Largest file read: two million triangles of a binary STL. A longer one would fill the memory first."""
 _TO_ASCII: Final = bytes(range(128)) + b"?" * 128
 
 
@@ -85,8 +84,6 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     if not len(faces):
         held = f"{len(corners)} points but no triangles" if len(corners) else "no triangles"
         raise MeshError(f"{path}: the file holds {held} (empty, cut short, or not a mesh); save it as a closed mesh")
-    if len(faces) > MAX_TRIANGLES:
-        raise MeshError(f"{path}: {len(faces)} triangles; at most {MAX_TRIANGLES} are taken: reduce the mesh")
     if faces.min() < 0 or faces.max() >= len(corners):
         raise MeshError(f"{path}: broken: triangles name corners outside the {len(corners)} there are; save it again")
     if bad := int((~np.isfinite(corners[faces]).all(axis=(1, 2))).sum()):
