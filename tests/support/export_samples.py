@@ -17,7 +17,6 @@ from train.data.frozen_presses import freeze_presses
 from train.learning.checkpoint import Training, fit_network, load_network
 from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
-from train.networks.named_networks import build
 from train.physics.pad_draws import KNOWN
 from train.trust import load_trust
 
@@ -67,20 +66,6 @@ def small_models(folder: Path) -> None:
     (folder / "sure.onnx").write_bytes(BEFORE)
     trust = load_trust(find_model("stsr-int8"))
     export(folder / "sure.pt", folder, some_frames(), validation=[some_frames()], trust=trust, intervals=INTERVALS)
-
-
-def published_model(folder: Path) -> None:
-    """Write peer.onnx: a network with batch normalisation, of another scale than the frames'."""
-    torch.manual_seed(0)
-    net = build("srcnn", 2)
-    for module in net.modules():
-        if isinstance(module, torch.nn.BatchNorm2d):
-            torch.nn.init.uniform_(module.get_buffer("running_mean"), -1, 1)
-            torch.nn.init.uniform_(module.get_buffer("running_var"), 0.5, 2)
-    with torch.no_grad():
-        list(net.parameters())[-1].abs_()  # or no pattern would be above zero
-    save_checkpoint(folder / "peer.pt", net, "srcnn")
-    export(folder / "peer.pt", folder, some_frames())
 
 
 def save_checkpoint(path: Path, net: PatternNet, name: str, **options: int) -> Path:

@@ -3,7 +3,6 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,7 @@ from train.errors import CheckpointError, DatasetError
 from train.fit import bundled, given_taps, main
 from train.learning.checkpoint import Training, fit_network, infer, load_network
 from train.learning.interval_fit import interval_coverage
-from train.learning.training_loop import DivergedError, Recipe, drawn_ahead, learning_rate_share, train
+from train.learning.training_loop import DivergedError, Recipe, learning_rate_share, train
 from train.networks.blocks import PatternNet, RelativeError
 from train.physics.pad_draws import KNOWN
 
@@ -318,17 +317,3 @@ def test_two_processes_share_every_batch_and_end_where_one_does(tmp_path):
     assert first[3] == pytest.approx(weights(trained(tmp_path)).tolist(), abs=1e-5)
     if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) > 1 and not torch.cuda.is_available():
         assert first[4] and second[4] and not set(first[4]) & set(second[4]), "two processes on one core wait for it"
-
-
-def test_the_next_is_drawn_while_one_is_used():
-    drawn = [threading.Event() for _ in range(3)]
-
-    def batch(number):
-        drawn[number].set()
-        return number
-
-    batches = drawn_ahead(batch, 0, 3)
-    assert next(batches) == 0
-    assert drawn[1].wait(20) and not drawn[2].is_set()
-    batches.close()
-    assert not drawn[2].is_set()
