@@ -14,7 +14,6 @@ from export_samples import (
     OPTIONS,
     PRESSES,
     SURE,
-    made_once,
     save_checkpoint,
     small_models,
     some_frames,
@@ -47,7 +46,9 @@ def frozen():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return made_once(tmp_path_factory, small_models)
+    folder = tmp_path_factory.mktemp("models")
+    small_models(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")

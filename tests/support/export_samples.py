@@ -1,12 +1,9 @@
-"""Small networks as training leaves them, and their models, each made once in a run of the tests."""
+"""A small network as training leaves it, and its model."""
 
-import fcntl
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-import pytest
 import torch
 from press_samples import make_press_set
 
@@ -31,21 +28,6 @@ BEFORE: Final = b"the one before"
 def some_frames(taps: int = 2) -> FrozenSet:
     """Return a few presses, which are not those of any training."""
     return freeze_presses(make_press_set(24, taps=taps, seed=1), 1).as_frozen_set()
-
-
-def made_once(tmp_path_factory: pytest.TempPathFactory, make: Callable[[Path], object]) -> Path:
-    """Return a folder that `make` has filled once in this run, by whichever process of it came first."""
-    root = tmp_path_factory.getbasetemp()
-    root = root.parent if root.name.startswith("popen-") else root
-    folder = root / make.__name__
-    with (root / f"{make.__name__}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not folder.exists():
-            draft = root / f"{make.__name__}.draft"
-            draft.mkdir()
-            make(draft)
-            draft.rename(folder)
-    return folder
 
 
 def small_models(folder: Path) -> None:
