@@ -121,8 +121,6 @@ class ContactSolver:
                 everywhere if None. Pressures are then means over cells.
         """
         indentation = np.broadcast_to(np.asarray(indentation_mm, dtype=np.float64), len(depth_mm))
-        if not (indentation > 0).all():
-            raise ValueError(f"indentation is {indentation.min()} mm, expected a positive depth")
         pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
         residual = np.zeros(len(depth_mm), dtype=np.float32)
         for poses, place in self._grid.boxes(depth_mm < REACH * indentation[:, None, None]):
