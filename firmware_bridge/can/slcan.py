@@ -14,9 +14,8 @@ A prefix cannot harm the frame after it, which is checked as if it stood alone. 
 INTO a letter starts a false frame, but too few characters follow it for eight data bytes; only the
 length digit of a stamped line leaves enough, and that false frame has no stamp.
 
-Of an adapter's own lines it takes the state, such as "sb000000", b for bus-off (Linux slcan-core.c), errors on the bus,
-such as "e1s", and eight flags in answer to `F`, which the request clears (Lawicel CAN232 manual, version 3). EasySYNC
-adapters answer without the F: that is a bad line.
+Of an adapter's own lines it takes eight flags in answer to `F`, which the request clears (Lawicel CAN232 manual,
+version 3). EasySYNC adapters answer without the F: that is a bad line.
 
 The limit: slcan has no checksum on the serial leg. A flipped hex digit, and a loss of exactly one
 line's length across two lines (the head of one frame with the tail of the next), give a well-formed
@@ -50,7 +49,6 @@ _FRAME = re.compile(rb"(?:([tr])([0-7][0-9A-Fa-f]{2})|([TR])([01][0-9A-Fa-f]{7})
 _LINE_END = re.compile(rb"[\r\a]")
 _REPLY = re.compile(rb"[zZ]?|[VN][0-9A-Za-z]{4}")
 _FLAGS = re.compile(rb"F[0-9A-Fa-f]{2}")
-_STATUS = re.compile(rb"s[awpb][0-9]{6}|e[1-9][abBcfoOs]{1,9}")
 
 
 class _Form(NamedTuple):
@@ -97,8 +95,7 @@ class SlcanDecoder:
     """
 
     def __init__(self) -> None:
-        self.flags = self.status_answers = self._status_lines = 0
-        self._off_at_frame: int | None = None
+        self.flags = self.status_answers = 0
         self.usual_line_bytes = _FORMS[False].line_bytes
         self._form: _Form | None = None
         self._newest_stamped = False
@@ -111,11 +108,6 @@ class SlcanDecoder:
         self._skipped_bytes = 0
         self._replies = 0
         self._refusals = 0
-
-    @property
-    def bus_off(self) -> bool:
-        """True if the adapter has reported bus-off, and since then no frame has come."""
-        return self._off_at_frame == self.frames
 
     def begin_anew(self) -> None:
         """Discard an unfinished line and the learnt form: the link broke, and the next bytes belong to neither."""
@@ -168,7 +160,6 @@ class SlcanDecoder:
             "skipped_bytes": self._skipped_bytes,
             "replies": self._replies,
             "refusals": self._refusals,
-            "status_lines": self._status_lines,
             "status_answers": self.status_answers,
         }
 
@@ -183,26 +174,16 @@ class SlcanDecoder:
                 return frame
         if _REPLY.fullmatch(line):
             self._replies += not refused
-        elif not self._takes_status(line):
+        elif _FLAGS.fullmatch(line):
+            self.flags = int(line[1:], 16)
+            self.status_answers += 1
+        else:
             self._skipped_bytes += len(line)
             if line[-LONGEST_LINE:].isascii():
                 self._bad_lines += 1
             else:
                 self._non_ascii_lines += 1
         return None
-
-    def _takes_status(self, line: bytes) -> bool:
-        """Take flags, a state or errors; False if the line is none of these."""
-        if _FLAGS.fullmatch(line):
-            self.flags = int(line[1:], 16)
-            self.status_answers += 1
-        elif _STATUS.fullmatch(line) and (line[:1] == b"s" or int(line[1:2]) == len(line) - 2):
-            self._status_lines += 1
-            if line[:1] == b"s":
-                self._off_at_frame = self.frames if line[1:2] == b"b" else None
-        else:
-            return False
-        return True
 
     def _takes(self, stamped: bool) -> bool:
         """Return True if the adapter sends frames of this form, and learn the form from it."""

@@ -129,13 +129,11 @@ class SlcanAdapter:
     Attributes:
         channel_open: True while it passes on the frames of the bus.
         flags: flags that `F` reports, Lawicel's bits; the report clears them.
-        bus_off: True where it has left the bus, and receives no frame.
     """
 
     def __init__(self) -> None:
         """Switch the adapter on."""
         self.flags = 0
-        self.bus_off = False
         self.channel_open = False
         self._bitrate: int | None = None
         self._timestamps = False
@@ -143,8 +141,8 @@ class SlcanAdapter:
 
     @property
     def hears_the_bus(self) -> bool:
-        """True if the channel is open at the bitrate of the sensor, and not bus-off."""
-        return self.channel_open and self._bitrate == 8 and not self.bus_off
+        """True if the channel is open at the bitrate of the sensor."""
+        return self.channel_open and self._bitrate == 8
 
     def begin_anew(self) -> None:
         """Start up again, as after a reset: closed, and at another bitrate than the sensor's."""

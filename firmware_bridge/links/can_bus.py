@@ -107,10 +107,8 @@ class CanBusLink(FrameLink):
     def _take(self, piece: Any, time_ns: int) -> list[Scan]:
         if piece.is_error_frame:
             self._counts["error_frames"] += 1
-            if self._interface == "socketcan":
+            if self._interface == "socketcan":  # each other driver reports it in its own way
                 self._scans.errors.error_frame(piece.arbitration_id, bytes(piece.data), time_ns)
-            else:
-                self._scans.errors.unsorted_error()  # each driver reports it in its own way
             return []
         if piece.is_fd:
             self._scans.errors.frame_heard()

@@ -51,7 +51,6 @@ LONGEST_LOOK_S: Final = 0.02  # longest time between two looks that find nothing
 
 ASKED_AGAIN_NS: Final = 5_000_000_000
 """Time between two requests for the status flags of a silent adapter, in [ns]: each request clears them."""
-BUS_OFF: Final = "the adapter reports bus-off: check bitrate, wiring and termination"
 BUS_ERRORS: Final = "the adapter reports errors on the bus, and no frame arrives: check bitrate, wiring and termination"
 _PORT_ERRORS: Final = (OSError, termios.error)  # pyserial lets termios.error through, which is no OSError
 
@@ -227,7 +226,7 @@ class SlcanSerialLink(Link):
                 if not port.out_waiting:
                     os.write(port.fileno(), STATUS_FLAGS)
         in_errors = decoder.status_answers > self._answers_at_scan and decoder.flags & BUS_FLAGS
-        self.trouble = BUS_OFF if decoder.bus_off else BUS_ERRORS if in_errors else None
+        self.trouble = BUS_ERRORS if in_errors else None
 
     def fetch(self) -> None:
         """Take the bytes there, without waiting for more."""

@@ -11,14 +11,13 @@ import time
 
 import pytest
 import serial
-from bridge_samples import SilentDevice, make_recording, read_scans
+from bridge_samples import SilentDevice, read_scans
 from edge_samples import wait_for
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
-from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import slcan_serial
-from firmware_bridge.links.slcan_serial import BUS_ERRORS, BUS_OFF, PortReader, SlcanSerialLink
+from firmware_bridge.links.slcan_serial import BUS_ERRORS, PortReader, SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
@@ -322,27 +321,21 @@ def impatient(limits):
     limits(slcan_serial, ASKED_AGAIN_NS=50 * MS, ADAPTER_ASKED_NS=40 * MS)
 
 
-def read_until(link: SlcanSerialLink, condition) -> None:
-    wait_for(lambda: link.read(0.01) is not None and condition())
-
-
 def test_a_silent_bus_with_errors_is_trouble(impatient):
     """The bitrate or the wiring is wrong: the adapter hears noise, and a frame never."""
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         of_flags = ((b"F00\r", None), (b"F5F\r", None), (b"F80\r", BUS_ERRORS), (b"F20\r", BUS_ERRORS))
-        for answered, (answer, trouble) in enumerate((*of_flags, (b"sb256256\r", BUS_OFF))):
+        for answered, (answer, trouble) in enumerate(of_flags):
             wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
             os.write(device.device_fd, answer)
-            wait_for(lambda n=answered: link.read(0.01) == [] and status_lines(link) > n)
+            wait_for(lambda n=answered: link.read(0.01) == [] and link.counters()["status_answers"] > n)
             assert link.trouble == trouble
-        os.write(device.device_fd, b"".join(cycle_lines(0)))
-        read_scans(link, 1)
-        assert link.trouble is None
-
-
-def status_lines(link: SlcanSerialLink) -> int:
-    counted = link.counters()
-    return counted["status_lines"] + counted["status_answers"]
+        link.__exit__(None, None, None)
+        with link:
+            assert (link.read(0.01), link.trouble) == ([], BUS_ERRORS), "an opening does not unsay it"
+            os.write(device.device_fd, b"".join(cycle_lines(0)))
+            read_scans(link, 1)
+            assert link.trouble is None
 
 
 def read_now(device: SilentDevice) -> bytes:
@@ -351,22 +344,3 @@ def read_now(device: SilentDevice) -> bytes:
         return os.read(device.device_fd, 1000)
     except BlockingIOError:
         return b""
-
-
-def test_opening_again_does_not_unsay_what_was_said(impatient):
-    """A link that lasts opens a silent adapter again and again: its trouble must not come and go with that."""
-    with Emulator([make_recording(10)], loop=True) as emulator:
-        link = SlcanSerialLink(emulator.port)
-        with link:
-            read_scans(link, 1)
-            emulator.adapter.bus_off = True
-            emulator.line.write(b"sb256256\r")
-            read_until(link, lambda: link.trouble == BUS_OFF)
-        for _ in range(2):
-            with link:
-                assert (link.read(0.01), link.trouble) == ([], BUS_OFF)
-        answers = link.counters()["status_answers"]
-        with link:
-            read_until(link, lambda: link.counters()["status_answers"] > answers)
-            emulator.adapter.bus_off = False
-            read_until(link, lambda: link.trouble is None)

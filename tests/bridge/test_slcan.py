@@ -101,7 +101,6 @@ def test_lines_of_frames(line, frame):
     ("line", "counted"),
     [
         *[(reply, {"replies": 1}) for reply in (b"\r", b"z\r", b"Z\r", b"V1013\r", b"N12ab\r", b"Vrt12\r")],
-        *[(line, {"status_lines": 1}) for line in (b"sa127095\r", b"sb000000\r", b"e1a\r", b"e4bBcc\r")],
         (b"F04\r", {"status_answers": 1}),
         (b"\a", {"refusals": 1}),
         (b"z\a", {"refusals": 1}),
@@ -112,24 +111,14 @@ def test_other_lines_are_counted(line, counted):
     assert decode(GOLDEN + line + OTHER) == ([GOLDEN_FRAME, OTHER_FRAME], {"frames": 2} | counted)
 
 
-@pytest.mark.parametrize(
-    ("lines", "flags", "bus_off"),
-    [
-        (b"", 0, False),
-        (b"F08\rF5a\r", 0x5A, False),
-        (b"sb256256\re1s\rF00\r", 0, True),
-        *[(b"sb256256\rs%c000000\r" % state, 0, False) for state in b"awp"],
-        (b"sb256256\r" + OTHER, 0, False),
-    ],
-)
-def test_the_status_of_the_adapter(lines, flags, bus_off):
+def test_the_flags_of_the_adapter():
     decoder = SlcanDecoder()
-    decoder.cut(GOLDEN + lines)
-    assert (decoder.flags, decoder.bus_off) == (flags, bus_off)
+    decoder.cut(GOLDEN + b"F08\rF5a\r")
+    assert (decoder.flags, decoder.status_answers) == (0x5A, 2)
 
 
 BAD = {
-    "cut off": (b"t0048937E31", b"t", b"V10", b"sa12709"),
+    "cut off": (b"t0048937E31", b"t", b"V10"),
     "a digit or two more": (b"t0048937E317E1593120F0", b"t0048937E317E1593120F00", b"t0048937E317E1593120F\n"),
     "nine bytes": (b"t0049937E317E1593120F00",),
     "a length of seven and eight bytes": (b"t0047937E317E1593120F",),
@@ -139,7 +128,6 @@ BAD = {
         b"F0G",
     ),
     "a remote frame with data": (b"r0048937E317E1593120F",),
-    "two errors, one letter, and none": (b"e2a", b"e0a"),
     "flags of EasySYNC, which mean something else, and nothing at all": (b"04", b"x"),
 }
 
