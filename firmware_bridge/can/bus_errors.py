@@ -22,7 +22,7 @@ class BusErrors:
     """State of the controller, and counters of what it went through."""
 
     def __init__(self) -> None:
-        self._counts = dict.fromkeys(("bus_off", "error_passive", "overflows"), 0)
+        self._counts: dict[str, int] = dict.fromkeys(("bus_off", "error_passive", "overflows"), 0)
         self._state: str | None = None
         self._told_before_opening = False
         self._lost_ns: int | None = None

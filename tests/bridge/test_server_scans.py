@@ -196,23 +196,6 @@ def cycle(number: int, taxels=range(16)) -> np.ndarray:
     return counts
 
 
-def test_what_comes_later_than_usual_is_counted_and_is_trouble():
-    """Readings that are always of some age are none: the vendor's own sample has 0.3 s from acquired to sent."""
-    server = Server()
-    for step in range(10):
-        server.say(10 * step, cycle(step), age_ms=300)
-    for step in range(10, 70):
-        server.say(10 * step, cycle(step), age_ms=300, way_ms=300)
-    assert server.counted("stale_scans") == (60,)
-    assert server.scans.trouble is not None and "older by 150 ms than usual" in server.scans.trouble
-    for step in range(100, 120):
-        server.say(10 * step, cycle(step), age_ms=300)
-    assert server.scans.trouble is not None  # no flicker
-    for step in range(120, 200):
-        server.say(10 * step, cycle(step), age_ms=300)
-    assert server.scans.trouble is None
-
-
 def test_a_still_pad_gives_repeated_scans():
     server = Server()
     scans = [scan for step in range(600) for scan in server.say(2 * step)]
