@@ -27,7 +27,6 @@ BIT_TIMING_LIMITS: Final = 4
 LIMITS_BYTES: Final = 40
 
 HARDWARE_STAMPS: Final = 1 << 4
-LPC546XX_QUIRK: Final = 1 << 9  # feature flag of a chip that needs one more byte after every frame sent to it
 
 RECEIVED: Final = 0xFFFFFFFF
 ECHO_IDS: Final = 10  # most frames under way to the bus at once, as in Linux; their echo ids are 0..9
@@ -129,11 +128,9 @@ def mode(*, started: bool, features: int = 0) -> bytes:
     return struct.pack("<II", started, features if started else 0)
 
 
-def encode_frame(frame: CanFrame, echo_id: int, limits: BitTimingLimits) -> bytes:
-    """Encode a frame to send on channel 0; `echo_id`, below ECHO_IDS, comes back once it has gone out."""
-    raw_id = frame.can_id | EXTENDED * frame.extended | REMOTE * frame.remote
-    data = _frame.pack(echo_id, raw_id, len(frame.data), 0, 0, 0, frame.data)
-    return data + b"\0" if limits.features & LPC546XX_QUIRK else data
+def encode_frame(frame: CanFrame, echo_id: int) -> bytes:
+    """Encode a standard data frame to send on channel 0; `echo_id`, below ECHO_IDS, comes back once it has gone out."""
+    return _frame.pack(echo_id, frame.can_id, len(frame.data), 0, 0, 0, frame.data)
 
 
 class HostFrame(NamedTuple):

@@ -95,13 +95,16 @@ def playing_rate_hz(recording: Recording, track: Track, rate_hz: float | None) -
 def bus_timeline(
     controllers: Sequence[Controller],
     *,
-    jitter_s: float,
-    seed: int,
     loop: bool,
+    jitter_s: float = 0.0,
+    seed: int = 0,
     frame_s: float = FRAME_S,
     played: Played = attrgetter("counts"),
 ) -> Iterator[tuple[float, CanFrame]]:
-    """Yield all frames on the bus in order, `frame_s` [s] long each, with their time in [s] from the first scan."""
+    """Yield all frames on the bus in order, `frame_s` [s] long each, with their time in [s] from the first scan.
+
+    Each scan comes early or late by up to `jitter_s` [s], drawn from the seed, as are the unused bytes of a frame.
+    """
     lanes = [_lane(controller, jitter_s, seed, loop, frame_s, played) for controller in controllers]
     return heapq.merge(*lanes, key=lambda timed: timed[0])
 
@@ -204,9 +207,7 @@ class Emulator:
         rate_hz: float | None = None,
         loop: bool = False,
         adapter: SlcanAdapter | None = None,
-        jitter_s: float = 0.001,
         frame_s: float = FRAME_S,
-        seed: int = 0,
         on_scan: Callable[[int, int], object] = lambda controller, time_ns: None,
         link: Path | None = None,
         waits: bool = False,
@@ -219,9 +220,7 @@ class Emulator:
             rate_hz: scans a second of each sensor; by default as recorded.
             loop: True to begin again after the last scan.
             adapter: the adapter, by default a good one.
-            jitter_s: largest time by which a scan comes early or late, in [s].
             frame_s: duration of a frame on the bus, in [s]; a real one carries no more than 480 scans a second.
-            seed: seed of jitter and unused bytes.
             on_scan: called with the controller and the monotonic time in [ns] of the last frame of a scan.
             link: link that points to the pseudo-terminal; by default clients use the terminal itself.
             waits: True to wait for a client that reads late, as no bus does, so that no frame is lost.
@@ -236,7 +235,7 @@ class Emulator:
         self.played_out = False
         self.adapter = SlcanAdapter() if adapter is None else adapter
 
-        self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, played=played)
+        self._timeline = bus_timeline(bus, loop=loop, frame_s=frame_s, played=played)
         self._frame_s = frame_s
         self._on_scan = on_scan
         self._last_frames = {sensor.model.wire_order(str(sensor.can_id))[-1][0]: sensor.can_id for sensor in bus}

@@ -14,7 +14,7 @@ open scan at once. So a scan costs little, also where the frames of several sens
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
 from operator import itemgetter
@@ -194,9 +194,6 @@ class _Sensor:
         self._taxel_count, self._scan_shape = geometry.taxel_count, geometry.scan_shape
         self._last_place = geometry.taxel_count - 1
         self._series = ScanSeries(name, geometry)
-        self._order: list[int] = []
-        self._in_place: Callable[[Sequence[int]], tuple[int, ...]] = tuple
-        self._pack = struct.Struct(f"={3 * geometry.taxel_count}i").pack
         self._held: list[tuple[NDArray[np.int32], int, int | None, int]] = []
         self._begins_known = self._half_before = False
         self._opened_ns = self._newest_ns = self._offset_ns = 0
@@ -341,17 +338,13 @@ class _Sensor:
             held = [closed for closed in held if closed[-1]]
         return [self._count(self._series.close(*closed, whole=missing == 0), missing) for *closed, missing in held]
 
-    def _counts_of(self, taxels: list[int], columns: Sequence[list[int]]) -> NDArray[np.int32]:
+    def _counts_of(self, taxels: Sequence[int], columns: Sequence[Sequence[int]]) -> NDArray[np.int32]:
         """Return counts (3, rows, cols) of readings in their order of arrival, ABSENT where no reading came."""
-        if taxels != self._order:  # which is the same each time, unless a frame was lost
-            self._order, come = taxels, len(taxels)
-            places = dict(zip(taxels, range(come), strict=True))
-            in_a_column = [places.get(taxel, come) for taxel in range(self._taxel_count)]
-            self._in_place = itemgetter(*(axis * (come + 1) + place for axis in range(3) for place in in_a_column))
-        # Plain integers up to the last step: for so few, numpy takes several times as long to put them in place.
-        x, y, z = columns
-        placed = self._in_place([*x, ABSENT, *y, ABSENT, *z, ABSENT])
-        return np.frombuffer(self._pack(*placed), dtype=np.int32).reshape(self._scan_shape)
+        count = self._taxel_count
+        placed = [ABSENT] * (3 * count)
+        for taxel, x, y, z in zip(taxels, *columns, strict=True):
+            placed[taxel], placed[taxel + count], placed[taxel + 2 * count] = x, y, z
+        return np.array(placed, dtype=np.int32).reshape(self._scan_shape)  # for so few numbers the fastest way
 
     def _count(self, scan: Scan, missing: int) -> Scan:
         self.counts["scans"] += 1

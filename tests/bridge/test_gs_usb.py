@@ -93,7 +93,7 @@ def test_requests_and_answers():
     """Source: Linux, drivers/net/can/usb/gs_usb.c."""
     assert (gs_usb.REQUEST_OUT, gs_usb.REQUEST_IN) == (0x41, 0xC1)
     assert (gs_usb.HOST_FORMAT, gs_usb.BIT_TIMING, gs_usb.MODE, gs_usb.BIT_TIMING_LIMITS) == (0, 1, 2, 4)
-    assert (gs_usb.HARDWARE_STAMPS, gs_usb.LPC546XX_QUIRK, gs_usb.OVERFLOW_FLAG) == (0x10, 0x200, 1)
+    assert (gs_usb.HARDWARE_STAMPS, gs_usb.OVERFLOW_FLAG) == (0x10, 1)
     assert gs_usb.mode(started=True, features=16) == struct.pack("<II", 1, 16)
     assert gs_usb.mode(started=False, features=16) == bytes(8)
     assert gs_usb.host_format() == b"\xef\xbe\0\0"
@@ -103,13 +103,8 @@ def test_requests_and_answers():
 
 
 def test_a_frame_to_send():
-    frame = CanFrame(0x201, b"\x07\0")
-    sent = gs_usb.encode_frame(frame, 3, CANDLELIGHT)
+    sent = gs_usb.encode_frame(CanFrame(0x201, b"\x07\0"), 3)
     assert sent == struct.pack("<IIBBBB8s", 3, 0x201, 2, 0, 0, 0, b"\x07")
-    quirky = CANDLELIGHT._replace(features=gs_usb.LPC546XX_QUIRK)
-    assert gs_usb.encode_frame(frame, 3, quirky) == sent + b"\0"
-    extended = gs_usb.encode_frame(CanFrame(0x1234567, b"", True, True), 0, CANDLELIGHT)
-    assert extended[4:8] == (0x1234567 | 0xC0000000).to_bytes(4, "little")
 
 
 FRAMES = st.builds(

@@ -280,7 +280,7 @@ def test_what_no_such_sensors_made_is_refused():
 
 def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
     with (
-        Emulator([make_recording(200, rate_hz=450.0)], jitter_s=0, waits=True) as emulator,
+        Emulator([make_recording(200, rate_hz=450.0)], waits=True) as emulator,
         SlcanSerialLink(emulator.port) as link,
     ):
         time.sleep(0.4)  # the terminal is full after .1 s; nor does it take its lateness for a stop, amid a scan
