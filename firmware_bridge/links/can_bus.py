@@ -1,6 +1,5 @@
 """Link over a CAN interface of python-can: socketcan, PEAK, Kvaser and others; esd is on socketcan."""
 
-import errno
 import logging
 import time
 from collections.abc import Callable
@@ -131,7 +130,7 @@ class CanBusLink(FrameLink):
         try:
             return self._can.Bus(channel=channel, interface=self._interface, ignore_config=True, **settings)
         except (self._can.CanError, OSError) as error:
-            raise DeviceError(f"{self.name}: {_reason(error)}") from error
+            raise DeviceError(f"{self.name}: cannot be opened: {error}") from error
         # Some interfaces let through every error that a missing or incomplete driver causes.
         except (NameError, AttributeError, TypeError, KeyError, ValueError, ImportError, NotImplementedError) as error:
             raise DeviceError(
@@ -163,12 +162,3 @@ def _check_network(name: str) -> None:
         )
     if problem := networks[name].problem:
         raise DeviceError(f"CAN network {name} {problem}")
-
-
-def _reason(error: Exception) -> str:
-    code = getattr(error, "errno", None)
-    if code in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
-        return "this kernel has no CAN: sudo modprobe can_raw"
-    if code in (errno.EACCES, errno.EPERM):
-        return f"no permission: {error}"
-    return f"cannot be opened: {error}"

@@ -1,6 +1,5 @@
 """The python-can link: its clocks, its bus errors, and what is refused at its opening."""
 
-import errno
 import itertools
 import sys
 import threading
@@ -13,12 +12,11 @@ from bridge_samples import frames_of
 from can.interfaces.virtual import VirtualBus
 from link_rigs import PulledBus, make_network, message_of
 
-from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
+from firmware_bridge.errors import DeviceError, SourceError
 from firmware_bridge.links import can_bus
 from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.discovery import can_interfaces, can_networks
-from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP
 
 
 @pytest.fixture
@@ -229,31 +227,3 @@ def test_a_network_that_is_not_there_or_down(networks, channel, words):
     if channel == "can0":  # `edge-sr devices` advises the same
         listed = can_interfaces(networks)[0]
         assert str(refused.value) == f"CAN network can0 {listed.problems[0]}"
-
-
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (OSError(errno.EAFNOSUPPORT, "Address family not supported"), "modprobe can_raw"),
-        (PermissionError(errno.EPERM, "Operation not permitted"), "no permission"),
-        (can.CanInitializationError("no such channel"), "cannot be opened: no such channel"),
-    ],
-)
-def test_why_a_network_cannot_be_opened(opens, error, words):
-    def refuse(**settings):
-        raise error
-
-    opens(refuse)
-    with pytest.raises(DeviceError, match=words) as refused:
-        CanBusLink("pcan", "0").__enter__()
-    assert not isinstance(refused.value, LinkLostError)
-
-
-def test_triggers_that_do_not_go_out(bus, monkeypatch):
-    def send(bus, message, timeout=None):
-        raise can.CanOperationError("Transmit buffer full")
-
-    monkeypatch.setattr(VirtualBus, "send", send)
-    with pytest.raises(DeviceError, match="does not send frames: Transmit buffer full"):
-        link_to(bus, model=LAYOUT_A_MAP).__enter__()
-    assert len(bus.channel) == 1, "it has left"

@@ -46,24 +46,6 @@ def test_what_came_before_the_loss_is_not_lost(monkeypatch):
     assert got == ([], 1, 1)
 
 
-@pytest.mark.parametrize("piece_bytes", [1, 62, 352])
-def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypatch):
-    """The same holds after a torn scan, which its own end cannot close.
-
-    Without stamps, a reader that does not run for some milliseconds within a scan splits it: here each arrives at once.
-    """
-    now_ns = [time.monotonic_ns()]
-    monkeypatch.setattr(slcan_serial.time, "monotonic_ns", lambda: now_ns[0])
-    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        for sent, complete in ((LINES, [True]), (LINES[:3] + LINES[4:], []), (LINES, [False, True]), (LINES, [True])):
-            text = b"".join(sent)
-            now_ns[0] += 10_000_000
-            for at in range(0, len(text), piece_bytes):
-                os.write(device.device_fd, text[at : at + piece_bytes])
-            scans = read_scans(link, len(complete))  # the torn one waits for the next
-            assert [scan.complete for scan in scans] == complete
-
-
 # The reader of the port.
 
 

@@ -258,32 +258,6 @@ def feed_cycle(assembler: ScanAssembler, number: int, time_ns: int = 0, *, stamp
     return feed_all(assembler, cycle(number), time_ns, [time_ns // 10] * 16, time_ns - 7 - time_ns // 10)
 
 
-@pytest.mark.parametrize("stamped", [False, True])
-def test_a_cycle_fed_as_one_is_the_scan_of_its_readings(stamped):
-    assembler, one_by_one = ScanAssembler(USPA44_MAP), ScanAssembler(USPA44_MAP)
-    for number in range(3):
-        (expected,) = feed_at(one_by_one, cycle(number), 100 * number * MS, stamped=stamped)
-        if number == 0:
-            (got,) = feed_at(assembler, cycle(0), stamped=stamped)
-        else:
-            (got,) = feed_cycle(assembler, number, 100 * number * MS, stamped=stamped)
-        assert (got.sensor, got.number, got.time_ns) == ("4", number, 100 * number * MS)
-        assert got.device_ns == expected.device_ns == (100 * number * MS - 7 if stamped else None)
-        np.testing.assert_array_equal(got.counts, expected.counts)
-        assert got.counts.shape == (3, 4, 4) and got.whole and expected.whole
-    assert counters(assembler) == counters(one_by_one) == {"readings": 48, "scans": 3}
-    assert feed_cycle(assembler, 2, 300 * MS, stamped=stamped)[0].repeated
-    assert counters(assembler) == {"readings": 64, "scans": 4, "repeated": 1}
-
-
-def test_the_first_cycle_after_an_outage_is_a_scan():
-    assembler = ScanAssembler(USPA44_MAP)
-    for number in range(2 * LEAST_INTERVALS):
-        feed_cycle(assembler, number, (1 + number) * 100 * MS, stamped=True)
-    assembler.begin_anew()
-    assert len(feed_cycle(assembler, 90, 20_000 * MS, stamped=True)) == 1
-
-
 @pytest.mark.parametrize(("pause_ns", "whole"), [(5 * MS, True), (6 * MS, False)])
 @pytest.mark.parametrize("together", [False, True])
 def test_half_of_the_period_by_the_stamps_is_a_pause(together, pause_ns, whole):
@@ -295,42 +269,6 @@ def test_half_of_the_period_by_the_stamps_is_a_pause(together, pause_ns, whole):
     parts = [slice(0, 16)] if together else [slice(0, 8), slice(8, 16)]
     scans = [scan for part in parts for scan in feed_all(assembler, cycle(50)[part], 2000 * MS, own_ns[part], 0)]
     assert [int(scan.fresh.sum()) for scan in scans] == ([16] if whole else [8, 8])
-
-
-@pytest.mark.parametrize("stamped", [False, True])
-def test_the_last_frame_of_a_cycle_again_is_a_duplicate(stamped):
-    assembler = ScanAssembler(USPA44_MAP)
-    feed_at(assembler, cycle(0), stamped=stamped)
-    feed_cycle(assembler, 1, stamped=stamped)
-    assert feed_at(assembler, cycle(1)[-1:], stamped=stamped) == []
-    assert counters(assembler) == {"readings": 33, "scans": 2, "duplicates": 1}
-    feed_cycle(assembler, 2, 10 * MS, stamped=stamped)
-    feed_at(assembler, cycle(1)[-1:], 10 * MS, stamped=stamped)
-    assert counters(assembler)["duplicates"] == 1 and counters(assembler)["resynchronised"] == 1
-
-
-def test_a_cycle_takes_doubts_of_the_order_away():
-    assembler, ends = ScanAssembler(USPA44_MAP), [cycle(number)[13:] for number in range(20)]
-    feed_at(assembler, cycle(0))
-    for number in range(1, MOST_DOUBTS):
-        feed_at(assembler, ends[number])
-    feed_cycle(assembler, 8)
-    for number in range(MOST_DOUBTS + 1, 2 * MOST_DOUBTS):
-        feed_at(assembler, ends[number])
-    assert assembler.fewest_missing() == 16
-    feed_at(assembler, ends[19])
-    assert assembler.fewest_missing() == 1, "one more, and the order is another: no pause is slept through meanwhile"
-    assert counters(assembler)["resynchronised"] == 15 * 3 and counters(assembler)["scans"] == 2
-
-
-@pytest.mark.parametrize("stamped", [False, True])
-def test_before_the_period_is_known_gaps_of_stamps_tell_a_pause(stamped):
-    """By arrival alone it is not: our being late would look like one."""
-    assembler, scans, now_ns = ScanAssembler(USPA44_MAP), [], 0
-    for number, reading in enumerate(cycle(0) + cycle(1)):
-        now_ns += 5 * MS if number == 25 else 130_000
-        scans += feed_one(assembler, reading, now_ns, DeviceTime(now_ns, now_ns) if stamped else None)
-    assert [int(scan.fresh.sum()) for scan in scans] == ([16, 9] if stamped else [16, 16])
 
 
 def test_where_stamps_end_the_open_scan_ends_too():

@@ -291,12 +291,6 @@ def test_a_slow_taxel_does_not_hold_up_the_others():
     assert sum(scan.complete for scan in scans) in (5, 6, 7, 8, 9, 10)
 
 
-def test_without_ups_the_usual_is_taken():
-    server = Server()
-    assert len([scan for step in range(100) for scan in server.say(10 * step, cycle(step), ups=None)]) == 100
-    assert 40 <= len([scan for step in range(100, 200) for scan in server.say(10 * step, cycle(99), ups=None)]) <= 60
-
-
 def test_what_the_vendor_says_besides():
     (scan,) = Server().say(0)
     assert scan.vendor.temperature_k.shape == scan.vendor.ups_hz.shape == (4, 4)

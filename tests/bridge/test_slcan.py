@@ -39,23 +39,6 @@ def test_what_is_encoded_is_decoded(sent):
     assert decode(b"".join(map(encode_frame, sent))) == (sent, {"frames": len(sent)} if sent else {})
 
 
-@pytest.mark.parametrize(
-    "frame",
-    [
-        CanFrame(0x800, b""),
-        CanFrame(-1, b""),
-        CanFrame(0x20000000, b"", extended=True),
-        CanFrame(1, bytes(9)),
-        CanFrame(1, b"\x01", remote=True),
-        CanFrame(1, b"", timestamp_ms=60_000),
-        CanFrame(1, b"", timestamp_ms=-1),
-    ],
-)
-def test_what_fits_no_frame_is_not_encoded(frame):
-    with pytest.raises(ValueError, match="expected"):
-        encode_frame(frame)
-
-
 # Bits and pieces of a stream as it may come, whole and broken.
 pieces = st.one_of(
     frames.map(encode_frame),
@@ -156,16 +139,6 @@ def test_the_form_of_lines_is_learnt_from_four_in_a_row(usual, other):
     # Unless the adapter has changed its mind, and with it we ours.
     got, counters = decode(taught + b"".join([*other, other[0], usual[0]]))
     assert (len(got), counters["bad_lines"]) == (4 + 2, few + 1)
-
-
-def test_what_breaks_the_row_begins_it_anew():
-    decoder = SlcanDecoder()
-    decoder.cut(GOLDEN * 5)
-    for between in (GOLDEN, b"T1FFFFFFF2ABCD\r"):
-        assert decoded(decoder, b"".join(STAMPED[:3])) == []
-        assert len(decoded(decoder, between)) == 1
-    assert decoded(decoder, b"".join(STAMPED[:3]) + b"z\rnoise\r") == []
-    assert len(decoded(decoder, STAMPED[3])) == 1, "neither replies nor bad lines are frames of the other form"
 
 
 # Damaged lines: bytes that are changed, cut, lost or of noise.
