@@ -203,8 +203,7 @@ class GsUsbBackend(usb.backend.IBackend):
     def bulk_write(self, dev_handle: _Plugged, ep: int, intf: int, data: "array[int]", timeout: int) -> int:
         adapter = dev_handle.check()
         self._check_claim(dev_handle)
-        if not adapter.take(data.tobytes()):
-            raise libusb_error(TIMEOUT)
+        adapter.take(data.tobytes())
         return len(data)
 
     def _check_claim(self, handle: _Plugged) -> None:
