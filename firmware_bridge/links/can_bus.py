@@ -87,9 +87,9 @@ class CanBusLink(FrameLink):
             self._close()
 
     def counters(self) -> dict[str, int]:
-        """Return the counts of frames by kind, bus and assembler; clock_restarts: steps back of the stamps' clock."""
+        """Return the counts of frames by kind, bus and assembler."""
         with self._counting:
-            return self._counts | {"clock_restarts": self._scans.clock.restarts} | self._scans.counters()
+            return self._counts | self._scans.counters()
 
     def _fetch(self, timeout_s: float) -> Any:
         if self._bus is None:

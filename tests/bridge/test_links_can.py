@@ -67,7 +67,6 @@ def test_a_step_of_the_wall_clock_does_not_hurt(bus, step_s):
             (scan,) = read_all(link, 16)
             assert scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns < 1_000_000
             now_ns[0] += 10_000_000
-        assert link.counters()["clock_restarts"] == (step_s < 0)
 
 
 @pytest.mark.parametrize("begun_us", [0, 10**9])
@@ -82,7 +81,7 @@ def test_stamps_that_count_from_the_opening_make_nothing_old(bus, begun_us):
             (scan,) = read_all(link, 16)
             delays_ns.append(scan.time_ns - scan.not_before_ns)
         now_ns[0] += 9 * 10**9
-    assert delays_ns == [0, 0] and link.counters()["clock_restarts"] == 0
+    assert delays_ns == [0, 0]
 
 
 # Errors of the bus.
