@@ -168,23 +168,13 @@ def test_speed_flow_control_and_low_latency_are_asked_for(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("port", "words"),
-    [
-        ("/dev/ttyNONE", r"/dev/ttyNONE: no such port\. Serial ports seen: "),
-        (__file__, "cannot be used as a serial port"),
-        ("/dev/null", "cannot be used as a serial port"),
-    ],
-)
-def test_what_is_no_serial_port(port, words):
-    with pytest.raises(DeviceError, match=words):
-        SlcanSerialLink(port).__enter__()
-
-
-@pytest.mark.parametrize(
     ("code", "words"),
     [(errno.EACCES, "dialout"), (errno.EPERM, "dialout"), (errno.EBUSY, "slcand"), (errno.EIO, "Input/output error")],
 )
 def test_why_a_port_cannot_be_opened(monkeypatch, code, words):
+    with pytest.raises(DeviceError, match=r"no such port\. Serial ports seen: "):
+        SlcanSerialLink("/dev/ttyNONE").__enter__()
+
     def refuse(*args, **kwargs):
         raise serial.SerialException(code, f"could not open port: [Errno {code}]")
 

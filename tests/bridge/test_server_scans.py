@@ -57,13 +57,10 @@ def test_every_form_of_the_counts(changes):
 @pytest.mark.parametrize(
     "changes",
     [
-        *({"data": data} for data in (None, "", "8000," * 47, "8000," * 49, [[0] * 3] * 16, {"0": 1}, 12)),
-        *(
-            {"data": ",".join(["8000"] * 47 + [last])}
-            for last in ("80 0", "-800", "8_00", "0x80", "18000", "\uff18\uff10\uff10\uff10", "")
-        ),
-        *({"data": [0] * 47 + last} for last in ([], [0, 0], [65536], [-1], [True], [1.0], ["1"], [None])),
-        *({"taxels": taxels} for taxels in (None, "16", 16.0, True, -16)),
+        *({"data": data} for data in (None, "", "8000," * 47, "8000," * 49, [[0] * 3] * 16)),
+        *({"data": ",".join(["8000"] * 47 + [last])} for last in ("-800", "8_00", "18000", "\uff18\uff10")),
+        *({"data": [0] * 47 + last} for last in ([], [0, 0], [65536], [-1], [True], [1.0])),
+        *({"taxels": taxels} for taxels in (None, "16", -16)),
     ],
     ids=str,
 )
@@ -116,25 +113,9 @@ def test_a_taxel_without_thermometer():
     ("counted", "texts"),
     [
         ("welcomes", ['{"message": "Welcome", "version": "1.7.6"}']),
-        (
-            "without_readings",
-            [
-                '{"message": 12}',
-                '{"message": 12, "sensors": 0, "type": "welcome"}',
-                '{"message": 12, "0x1": {}, "-1": {}, "": {}, "1234": {}, "²": {}, "1": []}',
-            ],
-        ),
-        (
-            "bad_json",
-            [
-                *(
-                    f'{{"message": {number}}}'
-                    for number in ('"welcome"', "true", "1.0", "NaN", "-1", "9" * 20, "9" * 6000)
-                ),
-                *("{}", "[1]", "null", "", b"\xff\xfe\x00", '{"message": 12, "time": 17', "x" * 50_000),
-                *("[" * 100_000, '{"1":' * 40_000),
-            ],
-        ),
+        ("without_readings", ['{"message": 12, "0x1": {}, "-1": {}, "": {}, "1234": {}, "²": {}, "1": []}']),
+        ("bad_json", [f'{{"message": {number}}}' for number in ("true", "1.0", "-1", "9" * 20, "9" * 6000)]),
+        ("bad_json", ["{}", "[1]", "", b"\xff\xfe\x00", '{"message": 12, "time": 17', "[" * 100_000, '{"1":' * 40_000]),
     ],
 )
 def test_other_messages(counted, texts):
