@@ -14,7 +14,6 @@ import program_cost
 import pytest
 from cli_samples import run
 from edge_samples import ROOT, make_contract, wait_for, write_model
-from program_cost import ratio_of
 
 from edge.bench import command
 from edge.bench import provenance as reports
@@ -274,12 +273,6 @@ def test_back_to_back_is_as_many_runs_as_fit(took_ms, most, runs):
 def test_the_front_is_who_is_not_beaten():
     points = [(9.0, 100.0), (5.0, 60.0), (2.0, 700.0), (2.0, 800.0), (1.9, 900.0), (5.0, 60.0)]
     assert front(points) == [False, True, True, False, True, True]
-
-
-def test_pairs_are_drawn_together_so_that_common_noise_cancels():
-    weather = np.random.default_rng(3).uniform(1, 3, 30)
-    paired = ratio_of(2 * weather, weather)
-    assert (paired.ratio, paired.low, paired.high) == pytest.approx((2, 2, 2)) and str(paired) == "2 (2..2)"
 
 
 def test_the_programs_cost_is_a_line_for_rest_and_for_contact(limits, capsys):
