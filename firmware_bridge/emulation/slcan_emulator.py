@@ -5,7 +5,7 @@ Controllers and adapter have no I/O and no clock; the `Emulator` plays them.
 
 import heapq
 import math
-import random
+import struct
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import groupby
@@ -31,20 +31,17 @@ Played = Callable[[Track], Iterable[NDArray[np.int32]]]
 """Function from a track to the scans that are played of it, in order."""
 
 
-def scan_frames(
-    counts: NDArray[np.int32], controller: int, noise: random.Random, model: ModelMap = USPA44_MAP
-) -> list[CanFrame]:
+def scan_frames(counts: NDArray[np.int32], controller: int, model: ModelMap = USPA44_MAP) -> list[CanFrame]:
     """Encode one scan (3, rows, cols) as a controller does: a frame per taxel, by SDA, then by taxel on it.
 
-    Absent taxels have no frame. The bytes that carry no reading are filled from `noise`, never zero.
+    Absent taxels have no frame. The bytes that carry no reading are as in a real frame, not zero.
     """
     frames: list[CanFrame] = []
     by_taxel = counts.reshape(3, -1).T.tolist()
     for can_id, taxel in model.wire_order(str(controller)):
         x, y, z = by_taxel[taxel]
         if x != ABSENT:
-            words = b"".join(value.to_bytes(2, "big") for value in (x, y, z))
-            frames.append(CanFrame(can_id, bytes([noise.randint(1, 255)]) + words + bytes([noise.randint(1, 255)])))
+            frames.append(CanFrame(can_id, struct.pack(">B3HB", 0x93, x, y, z, 0x0F)))
     return frames
 
 
@@ -93,32 +90,19 @@ def playing_rate_hz(recording: Recording, track: Track, rate_hz: float | None) -
 
 
 def bus_timeline(
-    controllers: Sequence[Controller],
-    *,
-    loop: bool,
-    jitter_s: float = 0.0,
-    seed: int = 0,
-    frame_s: float = FRAME_S,
-    played: Played = attrgetter("counts"),
+    controllers: Sequence[Controller], *, loop: bool, frame_s: float = FRAME_S, played: Played = attrgetter("counts")
 ) -> Iterator[tuple[float, CanFrame]]:
-    """Yield all frames on the bus in order, `frame_s` [s] long each, with their time in [s] from the first scan.
-
-    Each scan comes early or late by up to `jitter_s` [s], drawn from the seed, as are the unused bytes of a frame.
-    """
-    lanes = [_lane(controller, jitter_s, seed, loop, frame_s, played) for controller in controllers]
+    """Yield all frames on the bus in order, `frame_s` [s] long each, with their time in [s] from the first scan."""
+    lanes = [_lane(controller, loop, frame_s, played) for controller in controllers]
     return heapq.merge(*lanes, key=lambda timed: timed[0])
 
 
-def _lane(
-    controller: Controller, jitter_s: float, seed: int, loop: bool, frame_s: float, played: Played
-) -> Iterator[tuple[float, CanFrame]]:
-    noise = random.Random(f"{seed} {controller.can_id}")
+def _lane(controller: Controller, loop: bool, frame_s: float, played: Played) -> Iterator[tuple[float, CanFrame]]:
     number, free_s = 0, 0.0
     while True:
         for counts in played(controller.track):
-            # Jitter of single scans does not move the grid; a scan waits for the one before.
-            time_s = max(free_s, number / controller.rate_hz + noise.uniform(-jitter_s, jitter_s))
-            for frame in scan_frames(counts, controller.can_id, noise, controller.model):
+            time_s = max(free_s, number / controller.rate_hz)  # a scan waits for the one before
+            for frame in scan_frames(counts, controller.can_id, controller.model):
                 yield time_s, frame
                 time_s += frame_s
             number, free_s = number + 1, time_s

@@ -16,7 +16,7 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.scans.frame_scans import GsUsbScans
 
-SCAN = scan_frames(make_counts(1)[0], 4, random.Random(0))
+SCAN = scan_frames(make_counts(1)[0], 4)
 
 
 def host_frame(frame, *, echo_id=0xFFFFFFFF, channel=0, flags=0, more_id=0, stamp_us=None, fd=False, dlc=None):

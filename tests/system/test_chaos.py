@@ -42,7 +42,7 @@ def test_memory_stays_flat_and_latency_does_not_drift():
 
 def test_a_recording_is_played_among_faults_for_your_own_program(tmp_path):
     recording = make_recording(100)
-    frames = bus_timeline(controllers_of([recording], 400), jitter_s=0.0, seed=1, loop=True)
+    frames = bus_timeline(controllers_of([recording], 400), loop=True)
     bus = FaultyBus(numbered(frames), stretches("lost=.5@0+60", 1), 1, tmp_path / "port")
     with EmulatorThread([bus]), SlcanSerialLink(str(tmp_path / "port")) as link:
         scans = []
