@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
+from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.scans.scan_assembler import Readings, ScanAssembler, key
-from firmware_bridge.scans.wire_cycle import LEAST_INTERVALS, LONGEST_PAUSE_NS, MOST_DOUBTS
+from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, MOST_DOUBTS
 
 Reading = tuple[int, int, int, int]
 """Key of its id, and counts x, y, z."""
@@ -134,16 +134,6 @@ def test_renewed_is_against_the_taxels_own_reading_before():
     assert counters(assembler) == expected
 
 
-def test_a_bit_that_flips_in_one_id_of_fifty_invents_no_sensor():
-    """The same bit each time, so that the readings of a pretended sensor come at random, seldom two of one cycle."""
-    assembler, noise, ms, found = ScanAssembler(USPA44_MAP), random.Random(1), 1_000_000, set()
-    for number in range(6_000):
-        for place, reading in enumerate(cycle(number % 1000)):
-            flipped = (reading[0] | key(1), *reading[1:]) if noise.random() < 0.02 else reading
-            found |= {scan.sensor for scan in feed_all(assembler, [flipped], number * 10 * ms + place * 130_000)}
-    assert found == {"4"}
-
-
 @pytest.mark.parametrize("known", [False, True])
 def test_what_comes_after_a_pause_is_of_another_scan(known):
     """As where the bus was off for a moment: half of one press and half of another are no reading of the pad."""
@@ -188,15 +178,6 @@ def test_every_reading_is_in_a_scan_or_counted(seed, percent_lost):
         assert (scan.counts[2][scan.fresh] == 3000 + numbers).all()
 
 
-def test_a_link_that_broke_joins_no_halves():
-    assembler = ScanAssembler(USPA44_MAP)
-    feed(assembler, cycle(0) + cycle(1)[:8])
-    assembler.begin_anew()
-    assert feed(assembler, cycle(2)[8:], 100) == []
-    assert [scan.counts[2, 0, 0] for scan in feed(assembler, cycle(3), 200)] == [3003]
-    assert counters(assembler) == {"readings": 48, "scans": 2, "abandoned": 8, "resynchronised": 8}
-
-
 def test_a_scan_held_back_when_the_link_broke_never_comes():
     assembler, ms = ScanAssembler(USPA44_MAP), 1_000_000
 
@@ -235,52 +216,3 @@ def test_no_read_sleeps_while_an_order_is_to_be_learnt():
     assert assembler.fewest_missing() == 1
     feed(assembler, cycle(0) + cycle(1), 10_000)
     assert assembler.fewest_missing() == 16, "a sensor that exists does not wait for one that does not"
-
-
-# Readings that were read together, stamped or not, among others that come one by one.
-
-MS = 1_000_000
-
-
-def feed_at(assembler: ScanAssembler, parts: list[Reading], time_ns: int = 0, *, stamped: bool = False) -> list[Scan]:
-    """Feed readings of one moment; stamped, they were on the bus a tenth of that time from the device's beginning."""
-    device = DeviceTime(time_ns - 7, time_ns // 10) if stamped else None
-    return [scan for reading in parts for scan in feed_one(assembler, reading, time_ns, device)]
-
-
-def feed_cycle(assembler: ScanAssembler, number: int, time_ns: int = 0, *, stamped: bool = False) -> list[Scan]:
-    """Feed a whole cycle at once."""
-    if not stamped:
-        return feed_all(assembler, cycle(number), time_ns)
-    return feed_all(assembler, cycle(number), time_ns, [time_ns // 10] * 16, time_ns - 7 - time_ns // 10)
-
-
-@pytest.mark.parametrize(("pause_ns", "whole"), [(5 * MS, True), (6 * MS, False)])
-@pytest.mark.parametrize("together", [False, True])
-def test_half_of_the_period_by_the_stamps_is_a_pause(together, pause_ns, whole):
-    assembler = ScanAssembler(USPA44_MAP)
-    feed_at(assembler, cycle(0)[3:], stamped=True)  # of an unknown beginning: counts for nothing
-    for number in range(1, LEAST_INTERVALS + 2):
-        feed_cycle(assembler, number, 100 * number * MS, stamped=True)
-    own_ns = [100 * MS + place // 8 * pause_ns for place in range(16)]
-    parts = [slice(0, 16)] if together else [slice(0, 8), slice(8, 16)]
-    scans = [scan for part in parts for scan in feed_all(assembler, cycle(50)[part], 2000 * MS, own_ns[part], 0)]
-    assert [int(scan.fresh.sum()) for scan in scans] == ([16] if whole else [8, 8])
-
-
-def test_where_stamps_end_the_open_scan_ends_too():
-    """Arrivals are on another clock, by which no pause between the two shows."""
-    assembler = ScanAssembler(USPA44_MAP)
-    feed_at(assembler, cycle(0)[:5], 3 * MS, stamped=True)
-    (scan,) = feed_at(assembler, cycle(0)[5:] + cycle(1), 4 * MS)
-    assert scan.whole and counters(assembler) == {"readings": 32, "scans": 1, "abandoned": 5, "resynchronised": 11}
-
-
-def test_a_pause_is_measured_by_the_device_s_own_clock():
-    """Its times on our clock are a guess, and a better one may hide a pause: half a press would join another's half."""
-    assembler, clock = ScanAssembler(USPA44_MAP), DeviceClock(1_000_000, None)
-    feed_at(assembler, cycle(0))
-    for number, reading in enumerate(cycle(1)[:9]):
-        feed_one(assembler, reading, 400 * MS, clock.at(number, 400 * MS))
-    (torn,) = feed_one(assembler, cycle(2)[9], 450 * MS, clock.at(350, 450 * MS))
-    assert not torn.complete
