@@ -152,7 +152,7 @@ class HostFrame(NamedTuple):
 class GsUsbDecoder:
     """Decoder of a byte stream into host frames. Any chunking gives the same frames and the same counters."""
 
-    def __init__(self, *, stamped: bool = False) -> None:
+    def __init__(self, *, stamped: bool) -> None:
         self._pending = b""
         self._counts = dict.fromkeys(("frames", "error_frames", "echoes", "other_channels", "fd_frames"), 0)
         self._skipped_bytes = 0

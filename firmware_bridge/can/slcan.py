@@ -91,7 +91,6 @@ class SlcanDecoder:
         frames: number of frames so far, of any kind.
         usual_line_bytes: length of a usual frame's line as the adapter sends it, with its CR; that of the shorter
             form until the form is learnt.
-        pending_bytes: number of bytes of an unfinished line.
     """
 
     def __init__(self) -> None:
@@ -101,7 +100,6 @@ class SlcanDecoder:
         self._newest_stamped = False
         self._same_in_a_row = 0
         self._pending = b""
-        self.pending_bytes = 0
         self.frames = 0
         self._bad_lines = 0
         self._non_ascii_lines = 0
@@ -112,7 +110,7 @@ class SlcanDecoder:
     def begin_anew(self) -> None:
         """Discard an unfinished line and the learnt form: the link broke, and the next bytes belong to neither."""
         self._skipped_bytes += len(self._pending)
-        self._pending, self.pending_bytes = b"", 0
+        self._pending = b""
         self._form, self._same_in_a_row = None, 0
         self.usual_line_bytes = _FORMS[False].line_bytes
 
@@ -148,8 +146,12 @@ class SlcanDecoder:
         cut = max(position, len(buffer) - LONGEST_LINE)
         self._skipped_bytes += cut - position
         self._pending = buffer[cut:]
-        self.pending_bytes = len(self._pending)
         return pieces
+
+    @property
+    def pending_bytes(self) -> int:
+        """Number of bytes of an unfinished line."""
+        return len(self._pending)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of frames, of each other kind of line, and of bytes that belong to neither."""

@@ -47,7 +47,7 @@ class GsUsbScans(FrameScans):
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
         super().__init__(model)
-        self._decoder = GsUsbDecoder()
+        self._decoder = GsUsbDecoder(stamped=False)
 
     def start(self, *, stamped: bool) -> None:
         """Begin with a new clock after a start of the adapter, which may have reset its own."""

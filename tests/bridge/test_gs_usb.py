@@ -74,7 +74,7 @@ WIDE = {"tseg1_max": 256, "tseg2_max": 128}
         ({"clock_hz": 36_000_000}, (7, 7, 3, 1, 2)),
         ({"clock_hz": 48_500_000}, None),
         ({"tseg1_max": 3, "tseg2_min": 2}, None),
-        ({"brp_max": 1}, None),
+        ({"brp_max": 2}, None),
         ({"clock_hz": 0}, None),
         ({"clock_hz": 16_000_000, "brp_max": 1, "tseg2_max": 1}, None),
     ],
@@ -151,6 +151,10 @@ def test_what_is_in_a_frame(stamp_us):
     assert got == [HostFrame(frame, None, stamp_us, "flags" in more) for frame, more in sent]
     (error,) = decoder.feed(host_frame(CanFrame(0x40, bytes(8)), more_id=gs_usb.ERROR, stamp_us=stamp_us))
     assert error.error == 0x40 and decoder.counters()["error_frames"] == 1
+    assert decoder.feed(bytes(13)) == []
+    decoder.start(stamped=False)
+    assert decoder.feed(host_frame(standard)) == [HostFrame(standard, None, None, False)], "what it began is over"
+    assert decoder.counters()["skipped_bytes"] == 13
 
 
 ONE, TWO = host_frame(SCAN[1], stamp_us=1), host_frame(SCAN[2], stamp_us=1)
