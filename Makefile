@@ -48,7 +48,6 @@ reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each co
 	$(REPORT) -m train.experiments all
 	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md
 	$(BIN)/edge-sr bench --threads 1 --out reports
-	$(REPORT) tests/support/wire_faults.py --out reports/wire-faults.md
 	$(REPORT) tests/system/mutation_survey.py --out reports/mutation.md
 
 reports-stale: $(VENV)/.dev  ## a line for each report: fresh, or stale and why

@@ -53,8 +53,6 @@ SENSOR_SILENT_NS: Final = 2 * SLOWEST_PERIOD_NS
 a pose, after one that does not hold, after which their source is: some scans were without one by then."""
 TAPS_FORGOTTEN_NS: Final = 4 * SLOWEST_PERIOD_NS
 """Time without a scan after which earlier taps are dropped: a tap is over by then."""
-SCAN_GIVEN_UP_NS: Final = 4 * SLOWEST_PERIOD_NS
-"""Time after its first reading at which an incomplete scan is given up: later readings are another scan's."""
 SERVER_READING_OLD_NS: Final = 4 * SLOWEST_PERIOD_NS
 """Age at which a reading from the vendor's server belongs to a silent sensor."""
 TAXEL_SILENT_SCANS: Final = 50  # scans without a taxel after which its loss is reported, and zeroing goes on without it

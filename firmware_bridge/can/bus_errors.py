@@ -1,4 +1,4 @@
-"""Errors on a CAN bus and in its controller: a count of each kind, and the present state. No I/O, no clock.
+"""State of a CAN controller, by the error frames that it sends. No I/O, no clock.
 
 An error frame does not come from the bus: the controller creates it to report an event.
 Source: Linux include/uapi/linux/can/error.h, whose bits socketcan and gs_usb adapters share.
@@ -12,7 +12,6 @@ RX_OVERFLOW: Final = 0x01
 
 LOST_RECENTLY_NS: Final = 5_000_000_000  # time for which a loss of frames is reported, in [ns]
 
-_COUNTED: Final = ["bus_off", "error_passive", "error_warnings", "other_errors", "controller_overflows", "overflows"]
 _TROUBLE: Final = {
     "bus_off": "bus-off, the adapter has left the bus: check wires, termination and the bitrate of every node",
     "error_passive": "error-passive, most frames on the bus are garbled: check wires, termination and bitrate",
@@ -20,10 +19,10 @@ _TROUBLE: Final = {
 
 
 class BusErrors:
-    """Counters of error frames by kind, and the state of the controller."""
+    """State of the controller, and counters of what it went through."""
 
     def __init__(self) -> None:
-        self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
+        self._counts: dict[str, int] = dict.fromkeys(("bus_off", "error_passive", "overflows"), 0)
         self._state: str | None = None
         self._told_before_opening = False
         self._lost_ns: int | None = None
@@ -33,26 +32,16 @@ class BusErrors:
         self._told_before_opening = False
         controller = data[1] if classes & CONTROLLER and len(data) > 1 else 0
         if controller & RX_OVERFLOW:
-            self._counts["controller_overflows"] += 1
-            self._lost_ns = time_ns
+            self.overflow(time_ns)
         if classes & BUS_OFF:
             self.left_the_bus()
         elif controller & 0x30:  # passive, for received frames or sent ones
             self._enter("error_passive")
-        elif controller & 0x0C:  # a warning of either
-            self._counts["error_warnings"] += 1
-            self._state = None
-        elif classes & 0x100 or (classes & CONTROLLER and not controller & 0x03):  # restarted, or active again
-            self._state = None
-        elif not controller & RX_OVERFLOW:
-            self._counts["other_errors"] += 1
-
-    def unsorted_error(self) -> None:
-        """Count an error frame whose content cannot be decoded."""
-        self._counts["other_errors"] += 1
+        elif controller & 0x0C or classes & 0x100 or (classes & CONTROLLER and not controller & 0x03):
+            self._state = None  # a mere warning, restarted, or active again
 
     def overflow(self, time_ns: int) -> None:
-        """Count a report of the adapter that its queue was full, at `time_ns` [ns] of monotonic time."""
+        """Count a report that a queue of adapter or controller was full, at `time_ns` [ns] of monotonic time."""
         self._counts["overflows"] += 1
         self._lost_ns = time_ns
 
@@ -84,9 +73,8 @@ class BusErrors:
     def counters(self) -> dict[str, int]:
         """Return the counters by name.
 
-        bus_off, error_passive: times that the controller entered the state; error_warnings; other_errors: garbled
-        frames, as far as the controller reports them; controller_overflows: times that it had no room for a frame;
-        overflows: the same of the adapter's queue.
+        bus_off, error_passive: times that the controller entered the state; overflows: times that it, or the adapter's
+        queue, had no room for a frame.
         """
         return dict(self._counts)
 

@@ -12,7 +12,6 @@ Source: Linux drivers/net/can/usb/gs_usb.c; candleLight_fw include/gs_usb.h.
 """
 
 import struct
-from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from firmware_bridge.can.slcan import CanFrame
@@ -28,7 +27,6 @@ BIT_TIMING_LIMITS: Final = 4
 LIMITS_BYTES: Final = 40
 
 HARDWARE_STAMPS: Final = 1 << 4
-LPC546XX_QUIRK: Final = 1 << 9  # feature flag of a chip that needs one more byte after every frame sent to it
 
 RECEIVED: Final = 0xFFFFFFFF
 ECHO_IDS: Final = 10  # most frames under way to the bus at once, as in Linux; their echo ids are 0..9
@@ -99,17 +97,25 @@ class BitTiming(NamedTuple):
 
 
 def bit_timing(limits: BitTimingLimits) -> BitTiming:
-    """Return the timing for 1 Mbit/s with the sample point nearest to 87.5 %; of equal ones that of the finest quanta.
+    """Return the timing for 1 Mbit/s of the finest quanta that allow a usual sample point, 87.5 % or a little less.
 
     It raises ValueError if this controller cannot do it.
     """
-    timings = list(_timings(limits))
-    if not timings:
-        raise ValueError(
-            f"its CAN controller cannot do 1 Mbit/s sampled at {_SAMPLE_POINTS[0]:.0%} to {_SAMPLE_POINTS[1]:.0%} "
-            f"(clock {limits.clock_hz} Hz, divided by {limits.brp_min} to {limits.brp_max}): use another adapter"
-        )
-    return min(timings, key=lambda timing: (abs(timing.sample_point - 0.875), timing.brp))
+    clocks, rest = divmod(limits.clock_hz, BITRATE_BIT_S)
+    for brp in range(max(limits.brp_min, 1), min(limits.brp_max, clocks) + 1, max(limits.brp_inc, 1)):
+        quanta, uneven = divmod(clocks, brp)
+        phase_seg2 = min(max(-(-quanta // 8), limits.tseg2_min, 1), limits.tseg2_max)
+        # The adapter sums the first two segments; they are halved as in Linux.
+        tseg1 = quanta - 1 - phase_seg2
+        prop_seg = tseg1 // 2
+        timing = BitTiming(prop_seg, tseg1 - prop_seg, phase_seg2, max(1, min(limits.sjw_max, phase_seg2 // 2)), brp)
+        possible = not rest and not uneven and limits.tseg1_min <= tseg1 <= limits.tseg1_max
+        if possible and _SAMPLE_POINTS[0] <= timing.sample_point <= _SAMPLE_POINTS[1]:
+            return timing
+    raise ValueError(
+        f"its CAN controller cannot do 1 Mbit/s sampled at {_SAMPLE_POINTS[0]:.0%} to {_SAMPLE_POINTS[1]:.0%} "
+        f"(clock {limits.clock_hz} Hz, divided by {limits.brp_min} to {limits.brp_max}): use another adapter"
+    )
 
 
 def host_format() -> bytes:
@@ -122,11 +128,9 @@ def mode(*, started: bool, features: int = 0) -> bytes:
     return struct.pack("<II", started, features if started else 0)
 
 
-def encode_frame(frame: CanFrame, echo_id: int, limits: BitTimingLimits) -> bytes:
-    """Encode a frame to send on channel 0; `echo_id`, below ECHO_IDS, comes back once it has gone out."""
-    raw_id = frame.can_id | EXTENDED * frame.extended | REMOTE * frame.remote
-    data = _frame.pack(echo_id, raw_id, len(frame.data), 0, 0, 0, frame.data)
-    return data + b"\0" if limits.features & LPC546XX_QUIRK else data
+def encode_frame(frame: CanFrame, echo_id: int) -> bytes:
+    """Encode a standard data frame to send on channel 0; `echo_id`, below ECHO_IDS, comes back once it has gone out."""
+    return _frame.pack(echo_id, frame.can_id, len(frame.data), 0, 0, 0, frame.data)
 
 
 class HostFrame(NamedTuple):
@@ -149,12 +153,16 @@ class GsUsbDecoder:
     """Decoder of a byte stream into host frames. Any chunking gives the same frames and the same counters."""
 
     def __init__(self, *, stamped: bool) -> None:
-        """Configure the decoder as the adapter was started: with time stamps or not."""
-        self._stamped = stamped
-        self._frame_bytes = FRAME_BYTES + 4 * stamped
         self._pending = b""
         self._counts = dict.fromkeys(("frames", "error_frames", "echoes", "other_channels", "fd_frames"), 0)
         self._skipped_bytes = 0
+        self.start(stamped=stamped)
+
+    def start(self, *, stamped: bool) -> None:
+        """Begin with an adapter that was started with time stamps or without."""
+        self.end_transfer()
+        self._stamped = stamped
+        self._frame_bytes = FRAME_BYTES + 4 * stamped
 
     def end_transfer(self) -> None:
         """Discard an incomplete frame: the next transfer begins with another one."""
@@ -197,24 +205,3 @@ class GsUsbDecoder:
         classes = raw_id & _HIGHEST_EXTENDED
         frame = CanFrame(classes, data, raw_id & EXTENDED != 0, remote)
         return HostFrame(frame, classes if is_error else None, stamp_us, flags & OVERFLOW_FLAG != 0)
-
-
-def _timings(limits: BitTimingLimits) -> Iterator[BitTiming]:
-    clocks, rest = divmod(limits.clock_hz, BITRATE_BIT_S)
-    if rest:
-        return
-    step = max(limits.brp_inc, 1)
-    for brp in range(max(limits.brp_min, 1), min(limits.brp_max, clocks) + 1, step):
-        quanta, rest = divmod(clocks, brp)
-        if rest:
-            continue
-        for phase_seg2 in range(max(limits.tseg2_min, 1), min(limits.tseg2_max, quanta) + 1):
-            tseg1 = quanta - 1 - phase_seg2
-            if not limits.tseg1_min <= tseg1 <= limits.tseg1_max:
-                continue
-            # The adapter sums the first two segments; they are halved as in Linux.
-            prop_seg = tseg1 // 2
-            sjw = max(1, min(limits.sjw_max, phase_seg2 // 2, tseg1 - prop_seg))
-            timing = BitTiming(prop_seg, tseg1 - prop_seg, phase_seg2, sjw, brp)
-            if _SAMPLE_POINTS[0] <= timing.sample_point <= _SAMPLE_POINTS[1]:
-                yield timing

@@ -5,7 +5,7 @@ Controllers and adapter have no I/O and no clock; the `Emulator` plays them.
 
 import heapq
 import math
-import random
+import struct
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import groupby
@@ -31,20 +31,17 @@ Played = Callable[[Track], Iterable[NDArray[np.int32]]]
 """Function from a track to the scans that are played of it, in order."""
 
 
-def scan_frames(
-    counts: NDArray[np.int32], controller: int, noise: random.Random, model: ModelMap = USPA44_MAP
-) -> list[CanFrame]:
+def scan_frames(counts: NDArray[np.int32], controller: int, model: ModelMap = USPA44_MAP) -> list[CanFrame]:
     """Encode one scan (3, rows, cols) as a controller does: a frame per taxel, by SDA, then by taxel on it.
 
-    Absent taxels have no frame. The bytes that carry no reading are filled from `noise`, never zero.
+    Absent taxels have no frame. The bytes that carry no reading are as in a real frame, not zero.
     """
     frames: list[CanFrame] = []
     by_taxel = counts.reshape(3, -1).T.tolist()
     for can_id, taxel in model.wire_order(str(controller)):
         x, y, z = by_taxel[taxel]
         if x != ABSENT:
-            words = b"".join(value.to_bytes(2, "big") for value in (x, y, z))
-            frames.append(CanFrame(can_id, bytes([noise.randint(1, 255)]) + words + bytes([noise.randint(1, 255)])))
+            frames.append(CanFrame(can_id, struct.pack(">B3HB", 0x93, x, y, z, 0x0F)))
     return frames
 
 
@@ -93,29 +90,19 @@ def playing_rate_hz(recording: Recording, track: Track, rate_hz: float | None) -
 
 
 def bus_timeline(
-    controllers: Sequence[Controller],
-    *,
-    jitter_s: float,
-    seed: int,
-    loop: bool,
-    frame_s: float = FRAME_S,
-    played: Played = attrgetter("counts"),
+    controllers: Sequence[Controller], *, loop: bool, frame_s: float = FRAME_S, played: Played = attrgetter("counts")
 ) -> Iterator[tuple[float, CanFrame]]:
     """Yield all frames on the bus in order, `frame_s` [s] long each, with their time in [s] from the first scan."""
-    lanes = [_lane(controller, jitter_s, seed, loop, frame_s, played) for controller in controllers]
+    lanes = [_lane(controller, loop, frame_s, played) for controller in controllers]
     return heapq.merge(*lanes, key=lambda timed: timed[0])
 
 
-def _lane(
-    controller: Controller, jitter_s: float, seed: int, loop: bool, frame_s: float, played: Played
-) -> Iterator[tuple[float, CanFrame]]:
-    noise = random.Random(f"{seed} {controller.can_id}")
+def _lane(controller: Controller, loop: bool, frame_s: float, played: Played) -> Iterator[tuple[float, CanFrame]]:
     number, free_s = 0, 0.0
     while True:
         for counts in played(controller.track):
-            # Jitter of single scans does not move the grid; a scan waits for the one before.
-            time_s = max(free_s, number / controller.rate_hz + noise.uniform(-jitter_s, jitter_s))
-            for frame in scan_frames(counts, controller.can_id, noise, controller.model):
+            time_s = max(free_s, number / controller.rate_hz)  # a scan waits for the one before
+            for frame in scan_frames(counts, controller.can_id, controller.model):
                 yield time_s, frame
                 time_s += frame_s
             number, free_s = number + 1, time_s
@@ -129,13 +116,11 @@ class SlcanAdapter:
     Attributes:
         channel_open: True while it passes on the frames of the bus.
         flags: flags that `F` reports, Lawicel's bits; the report clears them.
-        bus_off: True where it has left the bus, and receives no frame.
     """
 
     def __init__(self) -> None:
         """Switch the adapter on."""
         self.flags = 0
-        self.bus_off = False
         self.channel_open = False
         self._bitrate: int | None = None
         self._timestamps = False
@@ -143,8 +128,8 @@ class SlcanAdapter:
 
     @property
     def hears_the_bus(self) -> bool:
-        """True if the channel is open at the bitrate of the sensor, and not bus-off."""
-        return self.channel_open and self._bitrate == 8 and not self.bus_off
+        """True if the channel is open at the bitrate of the sensor."""
+        return self.channel_open and self._bitrate == 8
 
     def begin_anew(self) -> None:
         """Start up again, as after a reset: closed, and at another bitrate than the sensor's."""
@@ -206,9 +191,7 @@ class Emulator:
         rate_hz: float | None = None,
         loop: bool = False,
         adapter: SlcanAdapter | None = None,
-        jitter_s: float = 0.001,
         frame_s: float = FRAME_S,
-        seed: int = 0,
         on_scan: Callable[[int, int], object] = lambda controller, time_ns: None,
         link: Path | None = None,
         waits: bool = False,
@@ -221,9 +204,7 @@ class Emulator:
             rate_hz: scans a second of each sensor; by default as recorded.
             loop: True to begin again after the last scan.
             adapter: the adapter, by default a good one.
-            jitter_s: largest time by which a scan comes early or late, in [s].
             frame_s: duration of a frame on the bus, in [s]; a real one carries no more than 480 scans a second.
-            seed: seed of jitter and unused bytes.
             on_scan: called with the controller and the monotonic time in [ns] of the last frame of a scan.
             link: link that points to the pseudo-terminal; by default clients use the terminal itself.
             waits: True to wait for a client that reads late, as no bus does, so that no frame is lost.
@@ -238,7 +219,7 @@ class Emulator:
         self.played_out = False
         self.adapter = SlcanAdapter() if adapter is None else adapter
 
-        self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, played=played)
+        self._timeline = bus_timeline(bus, loop=loop, frame_s=frame_s, played=played)
         self._frame_s = frame_s
         self._on_scan = on_scan
         self._last_frames = {sensor.model.wire_order(str(sensor.can_id))[-1][0]: sensor.can_id for sensor in bus}

@@ -1,6 +1,5 @@
 """Link over a CAN interface of python-can: socketcan, PEAK, Kvaser and others; esd is on socketcan."""
 
-import errno
 import logging
 import time
 from collections.abc import Callable
@@ -88,9 +87,9 @@ class CanBusLink(FrameLink):
             self._close()
 
     def counters(self) -> dict[str, int]:
-        """Return the counts of frames by kind, bus and assembler; clock_restarts: steps back of the stamps' clock."""
+        """Return the counts of frames by kind, bus and assembler."""
         with self._counting:
-            return self._counts | {"clock_restarts": self._scans.clock.restarts} | self._scans.counters()
+            return self._counts | self._scans.counters()
 
     def _fetch(self, timeout_s: float) -> Any:
         if self._bus is None:
@@ -107,10 +106,8 @@ class CanBusLink(FrameLink):
     def _take(self, piece: Any, time_ns: int) -> list[Scan]:
         if piece.is_error_frame:
             self._counts["error_frames"] += 1
-            if self._interface == "socketcan":
+            if self._interface == "socketcan":  # each other driver reports it in its own way
                 self._scans.errors.error_frame(piece.arbitration_id, bytes(piece.data), time_ns)
-            else:
-                self._scans.errors.unsorted_error()  # each driver reports it in its own way
             return []
         if piece.is_fd:
             self._scans.errors.frame_heard()
@@ -133,7 +130,7 @@ class CanBusLink(FrameLink):
         try:
             return self._can.Bus(channel=channel, interface=self._interface, ignore_config=True, **settings)
         except (self._can.CanError, OSError) as error:
-            raise DeviceError(f"{self.name}: {_reason(error)}") from error
+            raise DeviceError(f"{self.name}: cannot be opened: {error}") from error
         # Some interfaces let through every error that a missing or incomplete driver causes.
         except (NameError, AttributeError, TypeError, KeyError, ValueError, ImportError, NotImplementedError) as error:
             raise DeviceError(
@@ -165,12 +162,3 @@ def _check_network(name: str) -> None:
         )
     if problem := networks[name].problem:
         raise DeviceError(f"CAN network {name} {problem}")
-
-
-def _reason(error: Exception) -> str:
-    code = getattr(error, "errno", None)
-    if code in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
-        return "this kernel has no CAN: sudo modprobe can_raw"
-    if code in (errno.EACCES, errno.EPERM):
-        return f"no permission: {error}"
-    return f"cannot be opened: {error}"

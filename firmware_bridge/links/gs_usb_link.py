@@ -147,16 +147,9 @@ class GsUsbLink(FrameLink):
             if device.is_kernel_driver_active(INTERFACE):
                 device.detach_kernel_driver(INTERFACE)
                 self._driver_detached = True
-        try:
-            configuration = device.get_active_configuration()
-        except usb.core.USBError as error:
-            if error.errno is not None:
-                raise
-            device.set_configuration()  # no configuration is set; setting one again would reset the adapter
-            configuration = device.get_active_configuration()
-        usb.util.claim_interface(device, INTERFACE)
+        usb.util.claim_interface(device, INTERFACE)  # in the configuration that is set: setting one would reset it
         # One packet a transfer: a longer transfer would wait for more where frames fill their packets.
-        interface = usb.util.find_descriptor(configuration, bInterfaceNumber=INTERFACE)
+        interface = usb.util.find_descriptor(device.get_active_configuration(), bInterfaceNumber=INTERFACE)
         endpoint = usb.util.find_descriptor(interface, bEndpointAddress=ENDPOINT_IN)
         packet_bytes = getattr(endpoint, "wMaxPacketSize", 0) & 0x7FF
         self._packet = array.array("B", bytes(packet_bytes or 64))
@@ -171,7 +164,7 @@ class GsUsbLink(FrameLink):
         self._unread.empty_ns = self._clock_ns()  # from here on: this thread may not run for long after the start
         _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):
-            data = gs_usb.encode_frame(frame, number % gs_usb.ECHO_IDS, limits)
+            data = gs_usb.encode_frame(frame, number % gs_usb.ECHO_IDS)
             device.write(0x02, data, REQUEST_TIMEOUT_MS)
 
     def _stop(self, device: usb.core.Device) -> None:

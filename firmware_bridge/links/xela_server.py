@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final, Self
 
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, WebSocketException
+from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
@@ -30,7 +30,7 @@ class XelaServerLink(Link):
 
     Attributes:
         url: URL of the server.
-        trouble: sensors that are left out or silent, and readings that are old.
+        trouble: sensors that are left out or silent.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class XelaServerLink(Link):
         except ConnectionClosed as error:
             if scans:  # scans from before the end count; the next read reports the end
                 return scans
-            raise LinkLostError(f"{self.url}: link lost: {_ending(error)}") from error
+            raise LinkLostError(f"{self.url}: link lost, the server is gone: {error}") from error
         self.trouble = self._scans.trouble
         if not self._scans.usable:
             raise DeviceError(f"{self.url}: no sensor that can be used: {self.trouble}")
@@ -102,7 +102,7 @@ class XelaServerLink(Link):
         try:
             plain = socket.create_connection((host, port), OPENING_S)
         except (OSError, UnicodeError) as error:
-            raise DeviceError(f"{url}: {_unreachable(host, error)}") from error
+            raise DeviceError(f"{url}: {_unreachable(error)}") from error
         try:
             # The server is on this machine or near it: no proxy, and no compression, which costs time on both sides.
             # No pings: they would drop a server that sends messages but answers none.
@@ -117,7 +117,8 @@ class XelaServerLink(Link):
                 max_size=LONGEST_MESSAGE_BYTES,
             ).__enter__()  # websockets warns of a connection that was not entered
         except (OSError, WebSocketException, ValueError) as error:
-            raise DeviceError(f"{url}: {_no_handshake(error)}") from error
+            what = "is no xela_server, but another program, or one that expects TLS or hangs"
+            raise DeviceError(f"{url}: {what}: {error}") from error
 
 
 def server_address(url: str) -> tuple[str, int, str]:
@@ -131,33 +132,13 @@ def server_address(url: str) -> tuple[str, int, str]:
     return host.strip("[]"), port, f"ws://{host}:{port}"
 
 
-def _unreachable(host: str, error: OSError | UnicodeError) -> str:
+def _unreachable(error: OSError | UnicodeError) -> str:
     if isinstance(error, ConnectionRefusedError):
-        remedy = "start xela_server there, or name its port"
-        if host in ("localhost", "::1") or host.startswith("127."):
-            remedy += "; some versions (1.7.6) listen on the machine's own address alone: see hostname -I"
-        return f"connection refused: {remedy}"
+        return (
+            "connection refused: start xela_server there, or name its port; some versions (1.7.6) listen on the "
+            "machine's own address alone: see hostname -I"
+        )
     if isinstance(error, (socket.gaierror, UnicodeError)):  # UnicodeError: a name that is invalid in the DNS
         return "no such host: name it by its IP address, or see that it is in the DNS"
-    if isinstance(error, TimeoutError):
-        return f"no answer within {OPENING_S:g} s: is the machine on, on this network, and its firewall open?"
-    return f"cannot be reached: {error.strerror or error}"
-
-
-def _no_handshake(error: Exception) -> str:
-    if isinstance(error, TimeoutError):
-        return f"took the connection, and has not answered for {OPENING_S:g} s: it hangs, or is not an xela_server"
-    if isinstance(error, InvalidHandshake):
-        return f"is not an xela_server, but another program, or one that expects TLS: {error}"
-    return f"the connection broke while it was opened: {error}"
-
-
-def _ending(error: ConnectionClosed) -> str:
-    received = error.rcvd
-    if received is not None:
-        reason = f", {received.reason!r}" if received.reason else ""
-        return f"the server closed it (code {int(received.code)}{reason})"
-    sent = error.sent
-    if sent is not None:
-        return f"the server sent a message that no xela_server sends: {sent.reason or f'code {int(sent.code)}'}"
-    return "the server is gone"
+    why = getattr(error, "strerror", None) or error
+    return f"cannot be reached: {why}: is the machine on, on this network, and its firewall open?"

@@ -43,7 +43,6 @@ class DeviceClock:
     """Map from stamps of one device, which may wrap round, to the host's monotonic time.
 
     Attributes:
-        restarts: number of restarts of the device's clock.
         begun_ns: monotonic time of the first arrival since the last restart, which set the offset, in [ns]; None before
             it. That frame seems new even if it waited long to be read.
         dropped: True once the stamps have shown that they are no clock.
@@ -51,7 +50,6 @@ class DeviceClock:
 
     def __init__(self, tick_ns: int, wrap_ticks: int | None) -> None:
         """Start without a stamp; ticks are of `tick_ns` [ns], and wrap at `wrap_ticks`, None if they never do."""
-        self.restarts = 0
         self.begun_ns: int | None = None
         self.dropped = False
         self._tick_ns = tick_ns
@@ -94,7 +92,6 @@ class DeviceClock:
             # The number of wraps nearest to the time that passed on the host: a link may have been silent for hours.
             step_ns += round((since_ns - step_ns) / self._wrap_ns) * self._wrap_ns
         if self.begun_ns is not None and step_ns < -BACK_NS:
-            self.restarts += 1
             self.begin_anew()
         self._stamp_ns, self._arrival_ns = stamp_ns, arrival_ns
         self._device_ns += step_ns

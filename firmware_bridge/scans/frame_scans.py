@@ -47,13 +47,11 @@ class GsUsbScans(FrameScans):
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
         super().__init__(model)
-        self._earlier_counts: dict[str, int] = {}
         self._decoder = GsUsbDecoder(stamped=False)
 
     def start(self, *, stamped: bool) -> None:
-        """Begin with a new decoder and clock after a start of the adapter, which may have reset its clock."""
-        self._earlier_counts = self._sum_decoder_counts()
-        self._decoder = GsUsbDecoder(stamped=stamped)
+        """Begin with a new clock after a start of the adapter, which may have reset its own."""
+        self._decoder.start(stamped=stamped)
         self.clock = DeviceClock(1_000, 1 << 32)  # the 32-bit stamps wrap after 71.6 minutes
         self.errors.restarted()
 
@@ -75,7 +73,4 @@ class GsUsbScans(FrameScans):
 
     def counters(self) -> dict[str, int]:
         """Return the counters of all stages."""
-        return self._sum_decoder_counts() | super().counters()
-
-    def _sum_decoder_counts(self) -> dict[str, int]:
-        return {name: self._earlier_counts.get(name, 0) + count for name, count in self._decoder.counters().items()}
+        return self._decoder.counters() | super().counters()

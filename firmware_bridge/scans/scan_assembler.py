@@ -14,7 +14,7 @@ open scan at once. So a scan costs little, also where the frames of several sens
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
 from operator import itemgetter
@@ -29,7 +29,6 @@ from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, WireCycle
-from firmware_bridge.schedule import SCAN_GIVEN_UP_NS
 
 READING_BYTES: Final = 8
 """Bytes of the data of a reading: one unused, X, Y, Z as unsigned big-endian 16 bit, one unused. The unused ones are
@@ -86,8 +85,8 @@ class ScanAssembler:
         self._keys = set[int]()  # bounded: there are at most 2048 of standard ids
         self._runs = lru_cache(maxsize=32)(self._find_runs)  # those of whole cycles come again and again
         self._readings = 0
-        self._newest_ns = 0
         self._sensors: dict[str, _Sensor] = {}
+        self._speaking: list[_Sensor] = []  # those of which the newest readings are
 
     @property
     def can_ids(self) -> frozenset[int]:
@@ -114,17 +113,17 @@ class ScanAssembler:
         With time stamps `own_ns` are the times at which they were on the bus by the device's own clock, and `offset_ns`
         is that from it to the host's, in [ns].
         """
-        self._newest_ns = time_ns
         runs, keys = self._runs(readings.keys), len(readings.keys)
+        self._speaking = [self._sensor(name) for name in runs]
         closed: list[tuple[int, Scan]] = []
         sorted_out = 0
-        for name, (numbers, taxels) in runs.items():
+        for sensor, (numbers, taxels) in zip(self._speaking, runs.values(), strict=True):
             sorted_out += len(numbers)
             mine, times_ns = readings, own_ns
             if len(numbers) < keys:
                 mine = readings.taken(numbers)
                 times_ns = None if own_ns is None else [own_ns[number] for number in numbers]
-            scans = self._sensor(name).feed(mine, taxels, time_ns, times_ns, offset_ns)
+            scans = sensor.feed(mine, taxels, time_ns, times_ns, offset_ns)
             closed += [(numbers[at], scan) for at, scan in scans]
         self._readings += sorted_out
         self.foreign += keys - sorted_out
@@ -157,12 +156,11 @@ class ScanAssembler:
             sensor.begin_anew()
 
     def fewest_missing(self) -> int:
-        """Return the number of readings that must come at least before a scan can close whole.
+        """Return the number of readings that must come at least before a sensor that sends can close a whole scan.
 
-        A sensor that a flipped bit created, or that fell silent in mid-scan, is left out: it closes no scan.
+        One that a flipped bit created is left out.
         """
-        missing = [sensor.missing(self._newest_ns) for sensor in self._sensors.values()]
-        counts = [count for count in missing if count is not None]
+        counts = [sensor.missing for sensor in self._speaking if sensor.confirmed]
         if counts:
             return min(counts)
         # One as well while the order of a sensor is still to be learnt: no read may sleep through its pauses.
@@ -194,12 +192,9 @@ class _Sensor:
         self._taxel_count, self._scan_shape = geometry.taxel_count, geometry.scan_shape
         self._last_place = geometry.taxel_count - 1
         self._series = ScanSeries(name, geometry)
-        self._order: list[int] = []
-        self._in_place: Callable[[Sequence[int]], tuple[int, ...]] = tuple
-        self._pack = struct.Struct(f"={3 * geometry.taxel_count}i").pack
         self._held: list[tuple[NDArray[np.int32], int, int | None, int]] = []
         self._begins_known = self._half_before = False
-        self._opened_ns = self._newest_ns = self._offset_ns = 0
+        self._newest_ns = self._offset_ns = 0
         self._last: tuple[int, ...] | None = None
         self._own_ns: int | None = None
         self._taxels: list[int] = []
@@ -214,13 +209,9 @@ class _Sensor:
         self._last = self._own_ns = None
         self.wire.begin_anew()
 
-    def missing(self, now_ns: int) -> int | None:
-        """Return the number of readings until the open scan closes; 1 while the order is not learnt yet.
-
-        None: the sensor does not exist, or has left its open scan unfinished.
-        """
-        if not self.confirmed or (self._taxels and now_ns - self._opened_ns > SCAN_GIVEN_UP_NS):
-            return None
+    @property
+    def missing(self) -> int:
+        """Number of readings until the open scan closes; 1 while the order is not learnt yet."""
         return self._last_place - self._place if self.wire.order else 1
 
     def feed(
@@ -245,8 +236,6 @@ class _Sensor:
                 closed += [(at, scan) for scan in self._judge(taxels[at], gap_ns, stamped=own_ns is not None)]
             elif not self._taxels:
                 self._begins_known = True  # a run that opens a scan begins at the first place
-            if not self._taxels:
-                self._opened_ns = time_ns
             self._taxels += taxels[at:end]
             x, y, z = self._columns
             x += readings.x[at:end]
@@ -341,17 +330,13 @@ class _Sensor:
             held = [closed for closed in held if closed[-1]]
         return [self._count(self._series.close(*closed, whole=missing == 0), missing) for *closed, missing in held]
 
-    def _counts_of(self, taxels: list[int], columns: Sequence[list[int]]) -> NDArray[np.int32]:
+    def _counts_of(self, taxels: Sequence[int], columns: Sequence[Sequence[int]]) -> NDArray[np.int32]:
         """Return counts (3, rows, cols) of readings in their order of arrival, ABSENT where no reading came."""
-        if taxels != self._order:  # which is the same each time, unless a frame was lost
-            self._order, come = taxels, len(taxels)
-            places = dict(zip(taxels, range(come), strict=True))
-            in_a_column = [places.get(taxel, come) for taxel in range(self._taxel_count)]
-            self._in_place = itemgetter(*(axis * (come + 1) + place for axis in range(3) for place in in_a_column))
-        # Plain integers up to the last step: for so few, numpy takes several times as long to put them in place.
-        x, y, z = columns
-        placed = self._in_place([*x, ABSENT, *y, ABSENT, *z, ABSENT])
-        return np.frombuffer(self._pack(*placed), dtype=np.int32).reshape(self._scan_shape)
+        count = self._taxel_count
+        placed = [ABSENT] * (3 * count)
+        for taxel, x, y, z in zip(taxels, *columns, strict=True):
+            placed[taxel], placed[taxel + count], placed[taxel + 2 * count] = x, y, z
+        return np.array(placed, dtype=np.int32).reshape(self._scan_shape)  # for so few numbers the fastest way
 
     def _count(self, scan: Scan, missing: int) -> Scan:
         self.counts["scans"] += 1

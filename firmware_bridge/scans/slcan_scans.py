@@ -85,14 +85,9 @@ class SlcanScans:
             last_ms = stamps_ms[-1]
             rising = list(stamps_ms) == sorted(stamps_ms)
             if not rising or last_ms - stamps_ms[0] > LONGEST_RUN_MS:
-                # They wrap round, or are of no good clock, or may be of none: that shows in each, or in their parts.
-                size = (len(stamps_ms) + 1) // 2 if rising else 1
-                parts = [range(len(stamps_ms))[at : at + size] for at in range(0, len(stamps_ms), size)]
-                return [
-                    scan
-                    for part in parts
-                    for scan in self._feed(readings.taken(part), [stamps_ms[at] for at in part], time_ns)
-                ]
+                # They wrap round, or are of no good clock, or may be of none: that shows in each.
+                singles = ((readings.taken([at]), stamp_ms) for at, stamp_ms in enumerate(stamps_ms))
+                return [scan for one, stamp_ms in singles for scan in self._feed(one, [stamp_ms], time_ns)]
             device = self._device_time(last_ms, time_ns)
         if device is None:
             return self._assembler.feed(readings, time_ns)

@@ -15,7 +15,6 @@ reading of each.
 - Within a cycle nothing shows which readings belong together; slow servers mix those of two cycles, as on the wire.
 """
 
-from collections import deque
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
@@ -30,13 +29,8 @@ from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries, VendorReading
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
 from firmware_bridge.schedule import NS_PER_S, SERVER_READING_OLD_NS
 
-STALE_NS: Final = 150_000_000
-"""Age beyond the server's usual one at which an arriving reading counts as stale, in [ns]; more than a clock may be set
-back unnoticed."""
-MANY_STALE: Final = 50
-"""Surplus of stale scans over others at which the lag is reported, until the others have made up for it."""
 MOST_MISSED: Final = 100_000
-_COUNTED: Final = ["repeated_messages", "missed_messages", "server_restarts", "stale_scans"]
+_COUNTED: Final = ["repeated_messages", "missed_messages", "server_restarts"]
 _COUNTED_BY_SENSOR: Final = ["scans", "torn_wire", "torn_source", "repeated", "missing_taxels"]
 
 
@@ -54,10 +48,6 @@ class ServerScans:
         self._geometry = geometry
         self._decoder = ServerDecoder(geometry)
         self._sensors: dict[str, _ServerSensor] = {}
-        self._more_stale = 0
-        self._lags = False
-        # The least of them is the usual age: one observed server sends every reading 0.3 s old.
-        self._ages_ns: deque[int] = deque(maxlen=50)
         self._counted: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         self.begin()
 
@@ -68,9 +58,6 @@ class ServerScans:
         notes = [f"sensor {name} is left out: {what}, {wanted}" for name, what in self._decoder.foreign.items()]
         silent = [name for name, sensor in self._sensors.items() if sensor.silent]
         notes += [f"nothing arrives from sensor {name}: check its cable and its power" for name in silent]
-        if self._lags:
-            late = f"what is read is older by {STALE_NS // 1_000_000} ms than usual"
-            notes.append(f"{late}: the server lags, the network does, or this program is too slow")
         return "; ".join(notes) or None
 
     @property
@@ -104,7 +91,6 @@ class ServerScans:
                 device_ns = None if sent_ns is None or age_ns is None else sent_ns - age_ns
                 scan = sensor.feed(readings[name], arrival_ns, device_ns, old=(age_ns or 0) > SERVER_READING_OLD_NS)
                 if scan is not None:
-                    self._follow_age(scan, age_ns or 0)
                     scans.append(scan)
             sensor.look(arrival_ns)
         return scans
@@ -113,21 +99,13 @@ class ServerScans:
         """Return the counters of the decoder and of the scans.
 
         repeated_messages were dropped; missed_messages: numbers that never came; server_restarts: the count restarted;
-        stale_scans: a reading was older by STALE_NS than usual when it arrived; and as for every link scans, torn_wire,
-        torn_source, repeated and missing_taxels.
+        and as for every link scans, torn_wire, torn_source, repeated and missing_taxels.
         """
         totals: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
         for sensor in self._sensors.values():
             for name, count in sensor.counted.items():
                 totals[name] += count
         return self._decoder.counters() | self._counted | totals
-
-    def _follow_age(self, scan: Scan, age_ns: int) -> None:
-        self._ages_ns.append(age_ns)
-        stale = scan.device_ns is not None and scan.time_ns - scan.device_ns - min(self._ages_ns) > STALE_NS
-        self._counted["stale_scans"] += stale
-        self._more_stale = min(max(self._more_stale + (1 if stale else -1), 0), 2 * MANY_STALE)
-        self._lags = self._more_stale > (0 if self._lags else MANY_STALE)
 
     def _in_order(self, sequence: int) -> bool:
         """Return True if the message is a new one, and update the count: another order has only a new server's."""

@@ -16,7 +16,7 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.scans.frame_scans import GsUsbScans
 
-SCAN = scan_frames(make_counts(1)[0], 4, random.Random(0))
+SCAN = scan_frames(make_counts(1)[0], 4)
 
 
 def host_frame(frame, *, echo_id=0xFFFFFFFF, channel=0, flags=0, more_id=0, stamp_us=None, fd=False, dlc=None):
@@ -66,18 +66,15 @@ WIDE = {"tseg1_max": 256, "tseg2_max": 128}
     ("limits", "timing"),
     [
         ({}, (6, 7, 2, 1, 3)),
-        ({"brp_min": 3, "brp_max": 3}, (6, 7, 2, 1, 3)),
-        ({"tseg1_min": 13, "tseg1_max": 13, "tseg2_min": 2, "tseg2_max": 2}, (6, 7, 2, 1, 3)),
         ({"clock_hz": 8_000_000, "tseg2_min": 2, "tseg2_max": 2}, (2, 3, 2, 1, 1)),  # sampled at 0.75
         ({"clock_hz": 10_000_000, "tseg2_max": 1}, (4, 4, 1, 1, 1)),  # and at 0.9
         ({"clock_hz": 8_000_000, "tseg2_min": 0, "tseg2_max": 1}, (3, 3, 1, 1, 1)),
-        ({"clock_hz": 24_000_000, **WIDE}, (10, 10, 3, 1, 1)),
         ({"clock_hz": 80_000_000, **WIDE}, (34, 35, 10, 4, 1)),
-        ({"clock_hz": 170_000_000, **WIDE}, (74, 74, 21, 4, 1)),
-        ({"clock_hz": 36_000_000}, (7, 8, 2, 1, 2)),
+        ({"clock_hz": 170_000_000, **WIDE}, (73, 74, 22, 4, 1)),
+        ({"clock_hz": 36_000_000}, (7, 7, 3, 1, 2)),
         ({"clock_hz": 48_500_000}, None),
         ({"tseg1_max": 3, "tseg2_min": 2}, None),
-        ({"brp_max": 1}, None),
+        ({"brp_max": 2}, None),
         ({"clock_hz": 0}, None),
         ({"clock_hz": 16_000_000, "brp_max": 1, "tseg2_max": 1}, None),
     ],
@@ -96,7 +93,7 @@ def test_requests_and_answers():
     """Source: Linux, drivers/net/can/usb/gs_usb.c."""
     assert (gs_usb.REQUEST_OUT, gs_usb.REQUEST_IN) == (0x41, 0xC1)
     assert (gs_usb.HOST_FORMAT, gs_usb.BIT_TIMING, gs_usb.MODE, gs_usb.BIT_TIMING_LIMITS) == (0, 1, 2, 4)
-    assert (gs_usb.HARDWARE_STAMPS, gs_usb.LPC546XX_QUIRK, gs_usb.OVERFLOW_FLAG) == (0x10, 0x200, 1)
+    assert (gs_usb.HARDWARE_STAMPS, gs_usb.OVERFLOW_FLAG) == (0x10, 1)
     assert gs_usb.mode(started=True, features=16) == struct.pack("<II", 1, 16)
     assert gs_usb.mode(started=False, features=16) == bytes(8)
     assert gs_usb.host_format() == b"\xef\xbe\0\0"
@@ -106,13 +103,8 @@ def test_requests_and_answers():
 
 
 def test_a_frame_to_send():
-    frame = CanFrame(0x201, b"\x07\0")
-    sent = gs_usb.encode_frame(frame, 3, CANDLELIGHT)
+    sent = gs_usb.encode_frame(CanFrame(0x201, b"\x07\0"), 3)
     assert sent == struct.pack("<IIBBBB8s", 3, 0x201, 2, 0, 0, 0, b"\x07")
-    quirky = CANDLELIGHT._replace(features=gs_usb.LPC546XX_QUIRK)
-    assert gs_usb.encode_frame(frame, 3, quirky) == sent + b"\0"
-    extended = gs_usb.encode_frame(CanFrame(0x1234567, b"", True, True), 0, CANDLELIGHT)
-    assert extended[4:8] == (0x1234567 | 0xC0000000).to_bytes(4, "little")
 
 
 FRAMES = st.builds(
@@ -143,13 +135,6 @@ def test_any_cut_gives_the_same_and_nothing_raises(stream, seed, stamped):
     assert (got, pieces.counters()) == (expected, whole.counters())
 
 
-@given(st.lists(FRAMES, max_size=8))
-def test_every_frame_is_accounted_for(frames):
-    decoder = GsUsbDecoder(stamped=True)
-    decoder.feed(b"".join(frames))
-    assert sum(decoder.counters().values()) == len(frames) and decoder.counters()["skipped_bytes"] == 0
-
-
 @pytest.mark.parametrize("stamp_us", [None, 0xFFFFFFF0])
 def test_what_is_in_a_frame(stamp_us):
     decoder = GsUsbDecoder(stamped=stamp_us is not None)
@@ -166,6 +151,10 @@ def test_what_is_in_a_frame(stamp_us):
     assert got == [HostFrame(frame, None, stamp_us, "flags" in more) for frame, more in sent]
     (error,) = decoder.feed(host_frame(CanFrame(0x40, bytes(8)), more_id=gs_usb.ERROR, stamp_us=stamp_us))
     assert error.error == 0x40 and decoder.counters()["error_frames"] == 1
+    assert decoder.feed(bytes(13)) == []
+    decoder.start(stamped=False)
+    assert decoder.feed(host_frame(standard)) == [HostFrame(standard, None, None, False)], "what it began is over"
+    assert decoder.counters()["skipped_bytes"] == 13
 
 
 ONE, TWO = host_frame(SCAN[1], stamp_us=1), host_frame(SCAN[2], stamp_us=1)
@@ -227,18 +216,10 @@ def test_errors_by_sort_and_how_long_they_are_trouble():
         assert errors.trouble(0) is None
     errors.error_frame(0x88, bytes(8), 0)
     errors.error_frame(0x04, bytes((0, 0x01)) + bytes(6), 0)
-    errors.unsorted_error()
     errors.overflow(1_000)
     assert "lost frames" in (errors.trouble(1_000 + LOST_RECENTLY_NS - 1) or "")
     assert errors.trouble(1_000 + LOST_RECENTLY_NS) is None
-    assert errors.counters() == {
-        "bus_off": 2,
-        "error_passive": 1,
-        "error_warnings": 1,
-        "other_errors": 2,
-        "controller_overflows": 1,
-        "overflows": 1,
-    }
+    assert errors.counters() == {"bus_off": 2, "error_passive": 1, "overflows": 2}
 
 
 def test_device_time_goes_on_over_its_wrap_after_71_minutes():

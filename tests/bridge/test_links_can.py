@@ -1,6 +1,5 @@
 """The python-can link: its clocks, its bus errors, and what is refused at its opening."""
 
-import errno
 import itertools
 import sys
 import threading
@@ -13,12 +12,11 @@ from bridge_samples import frames_of
 from can.interfaces.virtual import VirtualBus
 from link_rigs import PulledBus, make_network, message_of
 
-from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
+from firmware_bridge.errors import DeviceError, SourceError
 from firmware_bridge.links import can_bus
 from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.discovery import can_interfaces, can_networks
-from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP
 
 
 @pytest.fixture
@@ -56,7 +54,7 @@ def test_frames_without_stamps_frames_of_fd_and_unknown_errors(bus):
         assert scan.complete and scan.device_ns is None
         counters = link.counters()
         assert (counters["fd_frames"], counters["readings"]) == (1, 16)
-        assert (counters["error_frames"], counters["other_errors"], counters["bus_off"]) == (1, 1, 0)
+        assert (counters["error_frames"], counters["bus_off"]) == (1, 0)
 
 
 @pytest.mark.parametrize("step_s", [-3600.0, 3600.0])
@@ -69,7 +67,6 @@ def test_a_step_of_the_wall_clock_does_not_hurt(bus, step_s):
             (scan,) = read_all(link, 16)
             assert scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns < 1_000_000
             now_ns[0] += 10_000_000
-        assert link.counters()["clock_restarts"] == (step_s < 0)
 
 
 @pytest.mark.parametrize("begun_us", [0, 10**9])
@@ -84,7 +81,7 @@ def test_stamps_that_count_from_the_opening_make_nothing_old(bus, begun_us):
             (scan,) = read_all(link, 16)
             delays_ns.append(scan.time_ns - scan.not_before_ns)
         now_ns[0] += 9 * 10**9
-    assert delays_ns == [0, 0] and link.counters()["clock_restarts"] == 0
+    assert delays_ns == [0, 0]
 
 
 # Errors of the bus.
@@ -229,31 +226,3 @@ def test_a_network_that_is_not_there_or_down(networks, channel, words):
     if channel == "can0":  # `edge-sr devices` advises the same
         listed = can_interfaces(networks)[0]
         assert str(refused.value) == f"CAN network can0 {listed.problems[0]}"
-
-
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (OSError(errno.EAFNOSUPPORT, "Address family not supported"), "modprobe can_raw"),
-        (PermissionError(errno.EPERM, "Operation not permitted"), "no permission"),
-        (can.CanInitializationError("no such channel"), "cannot be opened: no such channel"),
-    ],
-)
-def test_why_a_network_cannot_be_opened(opens, error, words):
-    def refuse(**settings):
-        raise error
-
-    opens(refuse)
-    with pytest.raises(DeviceError, match=words) as refused:
-        CanBusLink("pcan", "0").__enter__()
-    assert not isinstance(refused.value, LinkLostError)
-
-
-def test_triggers_that_do_not_go_out(bus, monkeypatch):
-    def send(bus, message, timeout=None):
-        raise can.CanOperationError("Transmit buffer full")
-
-    monkeypatch.setattr(VirtualBus, "send", send)
-    with pytest.raises(DeviceError, match="does not send frames: Transmit buffer full"):
-        link_to(bus, model=LAYOUT_A_MAP).__enter__()
-    assert len(bus.channel) == 1, "it has left"

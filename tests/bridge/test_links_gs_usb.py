@@ -5,7 +5,6 @@ import sys
 from functools import partial
 from itertools import count
 
-import can
 import pytest
 import usb.core
 from bridge_samples import frames_of
@@ -13,9 +12,7 @@ from gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
 from gs_usb_emulator import ACCESS, IO, PIPE, TIMEOUT, GsUsbBackend, GsUsbPort, libusb_error
 from usb.backend import libusb1
 
-from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
-from firmware_bridge.links import gs_usb_link
 from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.gs_usb_link import gs_usb_devices as list_devices
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP
@@ -135,17 +132,6 @@ def test_what_is_older_than_the_opening_is_dropped():
     assert not port.adapter.mute
 
 
-class Endless(GsUsbAdapter):
-    def fetch(self, timeout_s):
-        return bytes(24)
-
-
-def test_an_adapter_that_goes_on_sending_holds_up_no_opening(limits):
-    limits(gs_usb_link, MOST_OLD_TRANSFERS=20)
-    with opened(GsUsbPort(Endless))[1]:
-        pass
-
-
 def test_the_adapters_of_this_machine():
     foreign = GsUsbPort(usb_id=(0x0403, 0x6015))
     nameless = GsUsbPort(serial_number=None, product=None, usb_id=(0x1209, 0x2323))
@@ -190,15 +176,6 @@ def test_one_that_was_unplugged_is_told_from_others():
         assert known.adapter.started and not other.adapter.started
 
 
-def test_of_two_with_one_serial_number_each_has_its_place():
-    """And the one that is left is not taken for the other, whichever way they are plugged in again."""
-    left, right = (GsUsbPort(serial_number="AB", sockets=sockets) for sockets in ((2,), (1, 3)))
-    backend = GsUsbBackend(left, right)
-    for place, port, other in (("1-2", left, right), ("1-1.3", right, left)):
-        with GsUsbLink(place, backend=backend) as link:
-            assert link.name == f"gs_usb:{place}" and port.adapter.started and not other.adapter.started
-
-
 def test_a_serial_number_that_was_seen_twice_identifies_nothing():
     known, other = (GsUsbPort(serial_number="AB", sockets=(socket,)) for socket in (2, 3))
     backend = GsUsbBackend(known)
@@ -221,23 +198,11 @@ class Deaf(GsUsbAdapter):
         raise libusb_error(TIMEOUT)
 
 
-class Odd(GsUsbAdapter):
-    def request_in(self, number):
-        return b"no"
-
-
-class Full(GsUsbAdapter):
-    def take(self, data):
-        return False
-
-
 @pytest.mark.parametrize(
     ("adapter", "words"),
     [
         (partial(GsUsbAdapter, CANDLELIGHT._replace(clock_hz=8_500_000)), "cannot do 1 Mbit/s"),
         (Deaf, "does not answer: unplug it"),
-        (Odd, "2 bytes, expected 40"),
-        (Full, "does not answer"),
     ],
 )
 def test_adapters_that_cannot_be_used_are_given_back(adapter, words):
@@ -282,15 +247,3 @@ def test_usb_that_cannot_be_read_or_without_libusb(get_backend, monkeypatch):
     get_backend(lambda: None)
     with pytest.raises(DeviceError, match="libusb cannot be loaded: pip install libusb-package"):
         list_devices()
-
-
-def test_python_can_reads_it(get_backend):
-    backend = GsUsbBackend()
-    get_backend(lambda **_: backend)
-    public_port = backend.ports[0]
-    with can.Bus(interface="gs_usb", channel=0, bitrate=1_000_000) as bus:
-        public_port.adapter.hear(CanFrame(0x114, b"\1\2"), stamp_us=5_000_000)
-        message = bus.recv(1.0)
-        assert (message.arbitration_id, bytes(message.data), message.timestamp) == (0x114, b"\1\2", 5.0)
-        bus.send(can.Message(arbitration_id=0x201, data=b"\7\0", is_extended_id=False))
-        assert public_port.adapter.sent == [CanFrame(0x201, b"\7\0")]

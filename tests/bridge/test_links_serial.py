@@ -11,14 +11,13 @@ import time
 
 import pytest
 import serial
-from bridge_samples import SilentDevice, make_recording, read_scans
+from bridge_samples import SilentDevice, read_scans
 from edge_samples import wait_for
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
-from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import slcan_serial
-from firmware_bridge.links.slcan_serial import BUS_ERRORS, BUS_OFF, PortReader, SlcanSerialLink
+from firmware_bridge.links.slcan_serial import BUS_ERRORS, PortReader, SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
@@ -45,24 +44,6 @@ def test_what_came_before_the_loss_is_not_lost(monkeypatch):
             link.read(0.0)
         monkeypatch.undo()
     assert got == ([], 1, 1)
-
-
-@pytest.mark.parametrize("piece_bytes", [1, 62, 352])
-def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypatch):
-    """The same holds after a torn scan, which its own end cannot close.
-
-    Without stamps, a reader that does not run for some milliseconds within a scan splits it: here each arrives at once.
-    """
-    now_ns = [time.monotonic_ns()]
-    monkeypatch.setattr(slcan_serial.time, "monotonic_ns", lambda: now_ns[0])
-    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        for sent, complete in ((LINES, [True]), (LINES[:3] + LINES[4:], []), (LINES, [False, True]), (LINES, [True])):
-            text = b"".join(sent)
-            now_ns[0] += 10_000_000
-            for at in range(0, len(text), piece_bytes):
-                os.write(device.device_fd, text[at : at + piece_bytes])
-            scans = read_scans(link, len(complete))  # the torn one waits for the next
-            assert [scan.complete for scan in scans] == complete
 
 
 # The reader of the port.
@@ -187,23 +168,13 @@ def test_speed_flow_control_and_low_latency_are_asked_for(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("port", "words"),
-    [
-        ("/dev/ttyNONE", r"/dev/ttyNONE: no such port\. Serial ports seen: "),
-        (__file__, "cannot be used as a serial port"),
-        ("/dev/null", "cannot be used as a serial port"),
-    ],
-)
-def test_what_is_no_serial_port(port, words):
-    with pytest.raises(DeviceError, match=words):
-        SlcanSerialLink(port).__enter__()
-
-
-@pytest.mark.parametrize(
     ("code", "words"),
     [(errno.EACCES, "dialout"), (errno.EPERM, "dialout"), (errno.EBUSY, "slcand"), (errno.EIO, "Input/output error")],
 )
 def test_why_a_port_cannot_be_opened(monkeypatch, code, words):
+    with pytest.raises(DeviceError, match=r"no such port\. Serial ports seen: "):
+        SlcanSerialLink("/dev/ttyNONE").__enter__()
+
     def refuse(*args, **kwargs):
         raise serial.SerialException(code, f"could not open port: [Errno {code}]")
 
@@ -322,27 +293,21 @@ def impatient(limits):
     limits(slcan_serial, ASKED_AGAIN_NS=50 * MS, ADAPTER_ASKED_NS=40 * MS)
 
 
-def read_until(link: SlcanSerialLink, condition) -> None:
-    wait_for(lambda: link.read(0.01) is not None and condition())
-
-
 def test_a_silent_bus_with_errors_is_trouble(impatient):
     """The bitrate or the wiring is wrong: the adapter hears noise, and a frame never."""
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         of_flags = ((b"F00\r", None), (b"F5F\r", None), (b"F80\r", BUS_ERRORS), (b"F20\r", BUS_ERRORS))
-        for answered, (answer, trouble) in enumerate((*of_flags, (b"sb256256\r", BUS_OFF))):
+        for answered, (answer, trouble) in enumerate(of_flags):
             wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
             os.write(device.device_fd, answer)
-            wait_for(lambda n=answered: link.read(0.01) == [] and status_lines(link) > n)
+            wait_for(lambda n=answered: link.read(0.01) == [] and link.counters()["status_answers"] > n)
             assert link.trouble == trouble
-        os.write(device.device_fd, b"".join(cycle_lines(0)))
-        read_scans(link, 1)
-        assert link.trouble is None
-
-
-def status_lines(link: SlcanSerialLink) -> int:
-    counted = link.counters()
-    return counted["status_lines"] + counted["status_answers"]
+        link.__exit__(None, None, None)
+        with link:
+            assert (link.read(0.01), link.trouble) == ([], BUS_ERRORS), "an opening does not unsay it"
+            os.write(device.device_fd, b"".join(cycle_lines(0)))
+            read_scans(link, 1)
+            assert link.trouble is None
 
 
 def read_now(device: SilentDevice) -> bytes:
@@ -351,47 +316,3 @@ def read_now(device: SilentDevice) -> bytes:
         return os.read(device.device_fd, 1000)
     except BlockingIOError:
         return b""
-
-
-def test_opening_again_does_not_unsay_what_was_said(impatient):
-    """A link that lasts opens a silent adapter again and again: its trouble must not come and go with that."""
-    with Emulator([make_recording(10)], loop=True) as emulator:
-        link = SlcanSerialLink(emulator.port)
-        with link:
-            read_scans(link, 1)
-            emulator.adapter.bus_off = True
-            emulator.line.write(b"sb256256\r")
-            read_until(link, lambda: link.trouble == BUS_OFF)
-        for _ in range(2):
-            with link:
-                assert (link.read(0.01), link.trouble) == ([], BUS_OFF)
-        answers = link.counters()["status_answers"]
-        with link:
-            read_until(link, lambda: link.counters()["status_answers"] > answers)
-            emulator.adapter.bus_off = False
-            read_until(link, lambda: link.trouble is None)
-
-
-def test_stamps_are_not_asked_for_for_ever_where_nothing_comes(limits):
-    """Some adapters write the setting to an EEPROM each time."""
-    limits(slcan_serial, MOST_SILENT_OPENINGS=2, QUIET_S=0.001)
-    stamped, plain = b"C\rS8\rZ1\rO\rC\rZ0\r", b"C\rS8\rO\rC\r"
-    with SilentDevice() as device:
-        link = SlcanSerialLink(device.port)
-        for expected in (stamped, stamped, plain, plain):
-            with link:
-                pass
-            assert device.received(len(expected)) == expected
-        with link:
-            assert device.received(7) == b"C\rS8\rO\r"
-            os.write(device.device_fd, b"".join(cycle_lines(0)))
-            read_scans(link, 1)
-            assert device.received(7) == b"C\rZ1\rO\r"
-            wait_for(lambda: link.read(0.0) == [])
-            os.write(device.device_fd, b"".join(line for n in range(1, 9) for line in cycle_lines(n, 10 * n)))
-            scans = read_scans(link, 8)
-            assert all(scan.whole and scan.device_ns is not None for scan in scans), "no line of the new form is lost"
-        assert device.received(5) == b"C\rZ0\r", "asked for once"
-        with link:
-            pass
-        assert device.received(len(stamped)) == stamped

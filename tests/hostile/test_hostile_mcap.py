@@ -105,21 +105,16 @@ def of_scans(*changes, **settings):
             (rf"topic '/t1': .*{name}", of_scans(changes))
             for name, changes in (
                 ("sensor", {"sensor": ""}),
-                ("sensor", {"sensor": "a\nb"}),
                 ("number", {"number": -1}),
                 ("time_ns", {"time_ns": -1}),
                 ("time_ns", {"time_ns": 1 << 61}),
                 ("device_time_ns", {"device_time_ns": -2}),
                 ("fresh", {"fresh": 0x1FFFF}),
-                ("fresh", {"renewed": 0x10000}),
                 ("fresh", {"fresh": 0xFFFE, "renewed": 1}),
                 ("one on each axis", {"fresh": 0xFFFE, "renewed": 0}),
-                ("one on each axis", {"counts": np.full(48, -1)}),
-                ("counts", {"counts": np.full(48, -2)}),
                 ("counts", {"counts": np.full(48, 0x10000)}),
                 ("vendor_newtons", {"vendor_newtons": np.zeros(47)}),
                 ("vendor_newtons", {"vendor_newtons": np.full(48, np.nan)}),
-                ("vendor_newtons", {"vendor_newtons": np.full(48, -1001.0)}),
                 ("vendor_temperature_k", {"vendor_temperature_k": np.full(16, 199.0)}),
                 ("vendor_ups_hz", {"vendor_ups_hz": np.full(16, -1.0)}),
             )
@@ -129,8 +124,6 @@ def of_scans(*changes, **settings):
             for name, changes in (
                 ("sensor", {"sensor": ""}),
                 ("id", {"id": ""}),
-                ("created_unix_s", {"created_unix_s": -1.0}),
-                ("age_s", UNKNOWN_DATE | {"age_s": -1.0}),
                 ("age_s", UNKNOWN_DATE | {"age_s": 1e300}),
                 ("created_unix_s", {"created_unix_s": 1e300}),
                 ("scans", {"scans": 0}),
@@ -142,16 +135,15 @@ def of_scans(*changes, **settings):
                 "made.mcap",
                 (*OF_A_SENSOR, message(SENSOR, GOOD | {"facts": said}, 2), *of_scans({})),
             )
-            for said in ("", "[]", "[" * 5000, '{"mounting": 1}', '{"mounting": {}}', '{"geometry": {"rows": "9"}}')
+            for said in ("", "[" * 5000, '{"mounting": {}}', '{"geometry": {"rows": "9"}}')
         ),
         *(
             ("no mounting of sensor '4'", (Metadata("mounting", {"sensor": "4", "mounting": said}),))
             for said in (
-                *("", "[]", "{}", "[" * 5000),
+                *("", "{}", "[" * 5000),
                 json.dumps(SEATED | {"order": [0] * 16}),
                 json.dumps(SEATED | {"gains": [1e999] * 48}),
                 json.dumps(SEATED | {"swap_xy": 2}),
-                json.dumps(SEATED | {"order": [0.0, *range(1, 16)]}),
             )
         ),
         ("times of sensor '4' that go back", of_scans({"time_ns": 10}, {"time_ns": 9})),
@@ -199,17 +191,14 @@ BOMB = zstandard.compress(bytes(1 << 28))
     ("broken", "words"),
     [
         (chunk(b"", size=1 << 40), "expected at most"),
-        (chunk(b"", packed=BOMB, size=1 << 28), "expected at most"),
         (chunk(b"", packed=BOMB, size=1 << 20), r"does not hold the 1,048,576 bytes"),
         (chunk(b"abc", packed=b"nothing"), "cannot be unpacked"),
         (chunk(b"abc", crc=1), "check sum"),
         (chunk(b"abc", "rot13"), "compressed by 'rot13'"),
-        (chunk(b"abc", "lz4", packed=b"nothing"), "cannot be unpacked"),
         (chunk(b"abc"), "a chunk that is cut off"),
         (chunk(struct.pack("<BQ", 5, 1 << 60)), "a chunk that is cut off"),
         (chunk(struct.pack("<BQ", 5, 3) + b"abc"), "a message that is cut off"),
         (struct.pack("<BQ", 6, 1 << 62), "within a record"),
-        (struct.pack("<BQ", 4, 8) + b"\xff" * 8, "cannot be read"),
         (struct.pack("<BQ", 6, 40) + bytes(28) + struct.pack("<IQ", 0, 1 << 62), "cannot be unpacked"),
         (struct.pack("<BQ", 6, MOST_RECORD_BYTES + 1) + bytes(MOST_RECORD_BYTES + 1), "expected at most"),
     ],

@@ -2,7 +2,6 @@
 
 import csv
 import os
-import random
 import select
 import struct
 import time
@@ -35,8 +34,7 @@ def make_counts(scans: int, seed: int = 0) -> np.ndarray:
 
 def frames_of(scans: int, controller: int = 4, seed: int = 0) -> list[CanFrame]:
     """Return the frames of so many scans that all differ."""
-    noise = random.Random(seed)
-    return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller, noise)]
+    return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller)]
 
 
 def decoded(decoder: SlcanDecoder, data: bytes) -> list[CanFrame]:

@@ -25,7 +25,6 @@ def main() -> None:
     parser.add_argument("file", nargs="+", type=load_recording, help="recording, dealt out to the buses in turn")
     parser.add_argument("--buses", type=int, default=1, metavar="N")
     parser.add_argument("--rate-hz", type=float, help="scans a second of each sensor (default: as recorded)")
-    parser.add_argument("--jitter-ms", type=float, default=1.0, help="largest jitter of a scan")
     parser.add_argument("--frame-us", type=float, default=1e6 * FRAME_S, help="time of a frame on the bus")
     parser.add_argument("--stamps", type=Path, help="file for controller and time [ns] of each scan's last frame")
     options = parser.parse_args()
@@ -41,9 +40,7 @@ def main() -> None:
                 options.file[bus :: options.buses],
                 rate_hz=options.rate_hz,
                 loop=True,
-                jitter_s=options.jitter_ms / 1000,
                 frame_s=options.frame_us / 1e6,
-                seed=bus,
                 on_scan=on_scan(prefix),
             )
             for bus, prefix in enumerate(prefixes)

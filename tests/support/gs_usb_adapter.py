@@ -87,7 +87,8 @@ class GsUsbAdapter:
             raise StalledError(f"request {number} with {len(payload)} bytes")
         with self._changed:
             if number == gs_usb.BIT_TIMING:
-                self._set_timing(BitTiming(*struct.unpack_from("<5I", payload)))
+                timing = BitTiming(*struct.unpack_from("<5I", payload))
+                self.right_bitrate = self._limits.clock_hz == timing.quanta * timing.brp * gs_usb.BITRATE_BIT_S
             elif number == gs_usb.MODE:
                 wanted, features = struct.unpack_from("<II", payload)
                 self.started = wanted == 1
@@ -100,18 +101,13 @@ class GsUsbAdapter:
             return struct.pack("<10I", *self._limits)
         raise StalledError(f"request {number}")
 
-    def take(self, data: bytes) -> bool:
-        """Take a host frame to send; False while there is no room for its echo."""
+    def take(self, data: bytes) -> None:
+        """Take a host frame to send, and echo it."""
         with self._changed:
-            if len(self._queue) >= QUEUE_FRAMES:
-                return False
-            if len(data) < gs_usb.FRAME_BYTES or not self.started:
-                return True
-            echo_id, raw_id, dlc, _, _, _, payload = _FRAME.unpack_from(data)
-            extended, remote = raw_id & gs_usb.EXTENDED != 0, raw_id & gs_usb.REMOTE != 0
-            self.sent.append(CanFrame(raw_id & 0x1FFFFFFF, payload[:dlc], extended, remote))
-            self._enqueue(echo_id, raw_id, dlc, 0, payload, None)
-            return True
+            if self.started:
+                echo_id, raw_id, dlc, _, _, _, payload = _FRAME.unpack_from(data)
+                self.sent.append(CanFrame(raw_id, payload[:dlc]))
+                self._enqueue(echo_id, raw_id, dlc, 0, payload, None)
 
     def fetch(self, timeout_s: float | None) -> bytes | None:
         """Wait for the next host frame and return it; None when there is none in time, or the cable is out."""
@@ -155,14 +151,3 @@ class GsUsbAdapter:
         if self._waiting_for_host is None and self._queue:
             self._waiting_for_host = self._queue.popleft()
         return self._waiting_for_host is not None
-
-    def _set_timing(self, timing: BitTiming) -> None:
-        limits = self._limits
-        if not (
-            limits.tseg1_min <= timing.prop_seg + timing.phase_seg1 <= limits.tseg1_max
-            and limits.tseg2_min <= timing.phase_seg2 <= limits.tseg2_max
-            and 1 <= timing.sjw <= limits.sjw_max
-            and limits.brp_min <= timing.brp <= limits.brp_max
-        ):
-            return  # it ignores the request without an error
-        self.right_bitrate = limits.clock_hz == timing.quanta * timing.brp * gs_usb.BITRATE_BIT_S

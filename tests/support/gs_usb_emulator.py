@@ -135,9 +135,6 @@ class GsUsbBackend(usb.backend.IBackend):
         dev_handle.check()
         return 1
 
-    def set_configuration(self, dev_handle: _Plugged, config_value: int) -> None:
-        dev_handle.check()
-
     def claim_interface(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if dev_handle.port.kernel_driver or (dev_handle.port.claimed and not dev_handle.claimed_here):
@@ -163,9 +160,6 @@ class GsUsbBackend(usb.backend.IBackend):
         if dev_handle.port.claimed:
             raise libusb_error(BUSY)
         dev_handle.port.kernel_driver = True
-
-    def reset_device(self, dev_handle: _Plugged) -> None:
-        dev_handle.check().reset_usb()
 
     # Transfers.
 
@@ -209,8 +203,7 @@ class GsUsbBackend(usb.backend.IBackend):
     def bulk_write(self, dev_handle: _Plugged, ep: int, intf: int, data: "array[int]", timeout: int) -> int:
         adapter = dev_handle.check()
         self._check_claim(dev_handle)
-        if not adapter.take(data.tobytes()):
-            raise libusb_error(TIMEOUT)
+        adapter.take(data.tobytes())
         return len(data)
 
     def _check_claim(self, handle: _Plugged) -> None:

@@ -262,7 +262,7 @@ class ServerRig(Rig):
     """The vendor's server, emulated."""
 
     kind, sensor = "device", "1"
-    lost, away = "link lost: the server is gone", "connection refused"
+    lost, away = "link lost, the server is gone", "connection refused"
     decoder = ServerScans
 
     def __init__(self, folder, monkeypatch) -> None:

@@ -1,32 +1,27 @@
-"""Lines of an adapter that loses frames or bytes, or whose clock is bad, and what became of their scans. Pure.
+"""Frames of sensors on a faulty wire, the ways to read them, and what became of their scans. Pure.
 
-    python tests/support/wire_faults.py [--scans 20000] [--seed 1] [--out FILE] [WORD ...]
-
-plays every case, or those whose names hold all the words, and prints a line for each: scans, whole and torn ones, whole
-ones of two cycles, and whole cycles without a whole scan where nothing was lost. The exit code is 1 if a scan is mixed.
-With --out it writes them as a report.
+Every reading tells its sensor, taxel and cycle, so that a scan of two cycles is seen at once. A line of the head of one
+frame and the tail of another is a reading of neither, as the wire has no checksum.
 """
 
-import argparse
+import math
 import random
-import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from itertools import product
-from pathlib import Path
-from typing import Final, NamedTuple
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from operator import itemgetter
+from typing import Final
 
-from edge.bench.provenance import provenance
+from firmware_bridge.can import gs_usb
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import FRAME_S
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.frame_scans import GsUsbScans
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
 START_S: Final = 100.0
 WRAP_MS: Final = 60_000
-LOST_AT_ONCE: Final = (16, 32, 48)
-
 STAMPS: Final[dict[str, Callable[[float, random.Random], float]]] = {
     "good": lambda ms, _: ms,
     "jitter of 4 ms": lambda ms, draw: ms + draw.uniform(0, 4),
@@ -42,82 +37,12 @@ STAMPS: Final[dict[str, Callable[[float, random.Random], float]]] = {
     "in steps of 16 ms": lambda ms, _: ms // 16 * 16,
     "random": lambda _, draw: draw.randrange(WRAP_MS),
 }
-READERS: Final = ("each ms", "whole scans", "each 16 ms")
-FAULTS: Final = ("nothing", "frames", "bytes")
-_ABOUT: Final = """\
-Every reading is the number of its cycle, so a scan of two is seen at once. `frames`: 16, 32 or 48 in a row are lost, or
-a multiple of that; `bytes`: up to 60 ms of them, within lines too, as of a full terminal. `missed`: whole cycles that
-gave no whole scan; `late`: records that call a new reading old; `lag`: the longest time from bus to `device_time_ns`.
+READERS: Final = ("each ms", "whole scans", "each 16 ms", "usb")
+"""Of slcan lines; `usb`: of a gs_usb adapter with time stamps, a frame a transfer."""
 
-| time stamps | lost | read | sensors | cycles | whole scans | of them mixed | torn | missed | late | lag ms |
-|---|---|---|---|---|---|---|---|---|---|---|"""
-
-
-class Case(NamedTuple):
-    """A stream: its sensors and their rate, the clock of the stamps or None, how it is read, and what is lost."""
-
-    stamps: str | None = None
-    lost: str = "frames"
-    reader: str = "each ms"
-    sensors: int = 1
-    rate_hz: float = 100.0
-
-    def __str__(self) -> str:
-        stamps = f"stamps {self.stamps}" if self.stamps else "no stamps"
-        return f"{stamps}, {self.lost} lost, read {self.reader}, {self.sensors} at {self.rate_hz:g} Hz"
-
-
-@dataclass
-class Found:
-    """Outcome of a case.
-
-    Attributes:
-        cycles: number sent.
-        scans: number returned; torn: those without all sixteen; whole: the others.
-        mixed: whole ones with readings of two cycles. A line of the head of one and the tail of another is a reading of
-            neither, as the wire has no checksum.
-        missed: cycles of which every byte was handed on, and no whole scan was returned.
-        late: scans whose reading is called old, though it was on the bus less than 50 ms before.
-        lag_ms: longest time from bus to `device_ns`, beyond which none of them may be.
-    """
-
-    cycles: int = 0
-    scans: int = 0
-    whole: int = 0
-    torn: int = 0
-    mixed: int = 0
-    missed: int = 0
-    late: int = 0
-    lag_ms: float = 0.0
-
-
-def play(case: Case, cycles: int, seed: int = 1) -> Found:
-    """Play a case from the beginning, `cycles` of each sensor; its first fifty lose nothing."""
-    draw = random.Random(f"{seed} {case}")
-    scans, found, broken = SlcanScans(), Found(), set[tuple[int, int]]()
-    whole: set[tuple[int, int]] = set()
-    for data, now_s in _read(scans, case, _faulty(case, cycles, draw, broken), draw):
-        for scan in scans.feed(data, round(now_s * 1e9)):
-            found.scans += 1
-            sensor = int(scan.sensor)
-            owners = {
-                x
-                for taxel, (x, y, z) in enumerate(scan.counts.reshape(3, 16).T.tolist())
-                if scan.fresh.flat[taxel] and y == z ^ 0x5A5A == _check(x, sensor, taxel)  # else never sent
-            }
-            if not scan.complete:
-                found.torn += 1
-                continue
-            found.whole += 1
-            found.mixed += len(owners) > 1
-            whole |= {(sensor, cycle) for cycle in owners}
-            if scan.device_ns is not None:
-                bus_s = START_S + max(owners) / case.rate_hz + 16 * case.sensors * FRAME_S
-                found.late += scan.time_ns - scan.device_ns > 50_000_000 and now_s - bus_s < 0.05
-                found.lag_ms = max(found.lag_ms, (bus_s - scan.device_ns / 1e9) * 1e3)
-    sent = {(4 + 2 * sensor, cycle) for sensor in range(case.sensors) for cycle in range(cycles)}
-    found.cycles, found.missed = len(sent), len(sent - broken - whole)
-    return found
+Timed = tuple[float, CanFrame]
+Owner = tuple[int, int]
+"""Sensor and cycle of a reading."""
 
 
 def _check(cycle: int, sensor: int, taxel: int) -> int:
@@ -125,104 +50,195 @@ def _check(cycle: int, sensor: int, taxel: int) -> int:
     return (mixed ^ mixed >> 7) & 0xFFFF
 
 
-def _sent(case: Case, cycles: int, draw: random.Random) -> Iterator[tuple[float, tuple[int, int], bytes]]:
-    clock = STAMPS[case.stamps] if case.stamps else None
-    orders = {4 + 2 * n: USPA44_MAP.wire_order(str(4 + 2 * n)) for n in range(case.sensors)}
-    for cycle in range(cycles):
-        begin_s = cycle / case.rate_hz + draw.uniform(0, 0.05) / case.rate_hz
-        for place in range(16):
-            for lane, (sensor, order) in enumerate(orders.items()):
-                time_s = START_S + begin_s + (place * case.sensors + lane + 1) * FRAME_S
-                can_id, taxel = order[place]
+def bus(cycles: int, rates_hz: Sequence[float] = (100.0,), order: Sequence[int] = range(16)) -> list[Timed]:
+    """Return frames and their times, in [s], of sensors 4, 6, ..., each at its rate, its places in an order."""
+    draw, frames = random.Random(0), list[Timed]()
+    for lane, rate_hz in enumerate(rates_hz):
+        sensor = 4 + 2 * lane
+        ids = USPA44_MAP.wire_order(str(sensor))
+        for cycle in range(cycles):
+            begin_s = START_S + (cycle + draw.uniform(0, 0.05)) / rate_hz
+            for place in range(16):
+                can_id, taxel = ids[order[place]]
                 check = _check(cycle, sensor, taxel)
-                words = (cycle, check, check ^ 0x5A5A)
-                data = b"\x93" + b"".join(word.to_bytes(2, "big") for word in words) + b"\x0f"
-                stamp = None if clock is None else int(clock(time_s * 1e3, draw)) % WRAP_MS
-                yield time_s, (sensor, cycle), encode_frame(CanFrame(can_id, data, timestamp_ms=stamp))
+                data = struct.pack(">B3HB", 0x93, cycle, check, check ^ 0x5A5A, 0x0F)
+                frames.append((begin_s + (place * len(rates_hz) + lane + 1) * FRAME_S, CanFrame(can_id, data)))
+    return sorted(frames, key=itemgetter(0))
 
 
-def _faulty(
-    case: Case, cycles: int, draw: random.Random, broken: set[tuple[int, int]]
-) -> Iterator[tuple[float, bytes]]:
-    left, until_s, cut = 0, 0.0, False
-    for time_s, owner, line in _sent(case, cycles, draw):
-        text = line
-        if owner[1] >= 50 and case.lost != "nothing" and not left and time_s > until_s and draw.random() < 1 / 800:
-            if case.lost == "frames":
-                left = draw.choice(LOST_AT_ONCE) * (draw.choice((1, case.sensors)))
-            else:
-                until_s, cut = time_s + draw.uniform(0, 0.06), True
-                text = line[: draw.randrange(len(line) + 1)]
-        elif time_s > until_s and cut:
-            cut, text = False, line[draw.randrange(len(line) + 1) :]
-        elif time_s <= until_s:
-            text = b""
+def _owner(frame: CanFrame) -> Owner:
+    return frame.can_id & 0xF, int.from_bytes(frame.data[1:3], "big")
+
+
+# Faults.
+
+
+def losing(frames: Sequence[Timed], share: float) -> list[Timed]:
+    """Lose a share of the frames."""
+    draw = random.Random(1)
+    return [timed for timed in frames if draw.random() >= share]
+
+
+def doubling(frames: Sequence[Timed], share: float) -> list[Timed]:
+    """Give a share of the frames twice."""
+    draw = random.Random(0)
+    return [one for one in frames for _ in range(1 + (draw.random() < share))]
+
+
+def swapping(frames: Sequence[Timed], share: float) -> list[Timed]:
+    """Let frames change places."""
+    draw, swapped = random.Random(0), list(frames)
+    for at in range(len(frames) - 1):
+        if draw.random() < share:
+            (early_s, early), (late_s, late) = swapped[at : at + 2]
+            swapped[at : at + 2] = [(early_s, late), (late_s, early)]
+    return swapped
+
+
+def losing_cycles(frames: Sequence[Timed], sensors: int, draw: random.Random) -> list[Timed]:
+    """Lose as many frames in a row as make the parts of two cycles fit, after fifty cycles."""
+    left, kept = 0, list[Timed]()
+    for number, timed in enumerate(frames):
+        if number >= 800 * sensors and not left and draw.random() < 1 / 800:
+            left = draw.choice((16, 32, 48)) * draw.choice((1, sensors))
         if left:
-            left, text = left - 1, b""
-        if text != line:
-            broken.add(owner)
-        if text:
-            yield time_s, text
+            left -= 1
+        else:
+            kept.append(timed)
+    return kept
 
 
-def _read(
-    scans: SlcanScans, case: Case, lines: Iterator[tuple[float, bytes]], draw: random.Random
-) -> Iterator[tuple[bytes, float]]:
-    step_s = 0.016 if case.reader == "each 16 ms" else 0.001
+def losing_bytes(lines: Sequence[tuple[float, bytes]], sensors: int, draw: random.Random) -> list[tuple[float, bytes]]:
+    """Lose up to 60 ms of bytes at a time, within lines too, as of a full terminal, after fifty cycles."""
+    until_s, cut, kept = 0.0, False, list[tuple[float, bytes]]()
+    for number, (time_s, line) in enumerate(lines):
+        text = line
+        if time_s <= until_s:
+            text = b""
+        elif cut:
+            cut, text = False, line[draw.randrange(len(line) + 1) :]
+        elif number >= 800 * sensors and draw.random() < 1 / 800:
+            until_s, cut = time_s + draw.uniform(0, 0.06), True
+            text = line[: draw.randrange(len(line) + 1)]
+        kept.append((time_s, text))
+    return kept
+
+
+# Reading.
+
+
+@dataclass
+class Found:
+    """What became of the scans.
+
+    Attributes:
+        numbers: cycles of the whole scans, by sensor.
+        torn: scans without all sixteen readings.
+        mixed: whole ones with readings of two cycles.
+        missed: cycles of which every byte was handed on, and no whole scan was returned.
+        late: scans whose reading is called old, though it was on the bus less than 50 ms before.
+        lag_ms: longest time from bus to `device_ns`, beyond which none of them may be.
+        wait_ns: longest time from the arrival of a scan's newest reading until it was returned.
+        counters: those of the link.
+    """
+
+    numbers: dict[str, list[int]] = field(default_factory=dict)
+    torn: int = 0
+    mixed: int = 0
+    missed: int = 0
+    late: int = 0
+    lag_ms: float = 0.0
+    wait_ns: int = 0
+    counters: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def whole(self) -> int:
+        """Number of whole scans."""
+        return sum(map(len, self.numbers.values()))
+
+
+def read(
+    frames: Sequence[Timed], stamps: str | None, reader: str, *, bytes_lost: int = 0, broken_s: float = math.inf
+) -> Found:
+    """Read frames with these time stamps of an slcan adapter; `bytes_lost` of so many sensors.
+
+    The link breaks at `broken_s` [s], and is opened again.
+    """
+    draw, found, ends_s = random.Random(f"{stamps} {reader}"), Found(), dict[Owner, float]()
+    lines = list(_lines(frames, stamps, draw))
+    kept = losing_bytes(lines, bytes_lost, draw) if bytes_lost else lines
+    handed = Counter[Owner]()
+    for (time_s, frame), (_, line), (_, text) in zip(frames, lines, kept, strict=True):
+        ends_s[_owner(frame)] = time_s
+        handed[_owner(frame)] += text == line
+    if reader == "usb":
+        scans = GsUsbScans()
+        scans.start(stamped=True)
+        pieces = _transfers(frames)
+    else:
+        scans = SlcanScans()
+        pieces = _pieces(scans, reader, kept, draw)
+    for now_s, data in pieces:
+        if now_s > broken_s:
+            scans.begin_anew()
+            broken_s = math.inf
+        now_ns = round(now_s * 1e9)
+        for scan in scans.feed(data, now_ns):
+            sensor = int(scan.sensor)
+            cycles = {
+                x
+                for taxel, (x, y, z) in enumerate(scan.counts.reshape(3, 16).T.tolist())
+                if scan.fresh.flat[taxel] and y == z ^ 0x5A5A == _check(x, sensor, taxel)  # else never sent
+            }
+            if not scan.complete:
+                found.torn += 1
+                continue
+            newest = max(cycles)
+            found.numbers.setdefault(scan.sensor, []).append(newest)
+            found.mixed += len(cycles) > 1
+            found.wait_ns = max(found.wait_ns, now_ns - scan.time_ns)
+            if scan.device_ns is not None:
+                bus_s = ends_s[sensor, newest]
+                found.late += scan.time_ns - scan.device_ns > 50_000_000 and now_s - bus_s < 0.05
+                found.lag_ms = max(found.lag_ms, (bus_s - scan.device_ns / 1e9) * 1e3)
+    whole = {(int(sensor), cycle) for sensor, cycles in found.numbers.items() for cycle in cycles}
+    found.missed = len({owner for owner, lines in handed.items() if lines == 16} - whole)
+    found.counters = scans.counters()
+    return found
+
+
+def _lines(frames: Iterable[Timed], stamps: str | None, draw: random.Random) -> Iterator[tuple[float, bytes]]:
+    for time_s, frame in frames:
+        stamp_ms = None if stamps is None else int(STAMPS[stamps](time_s * 1e3, draw)) % WRAP_MS
+        yield time_s, encode_frame(frame._replace(timestamp_ms=stamp_ms))
+
+
+def _transfers(frames: Iterable[Timed]) -> Iterator[tuple[float, bytes]]:
+    for time_s, frame in frames:
+        head = struct.pack("<IIBBBB", gs_usb.RECEIVED, frame.can_id, 8, 0, 0, 0)
+        yield time_s + 0.0002, head + frame.data + struct.pack("<I", round(time_s * 1e6))
+
+
+def _pieces(
+    scans: SlcanScans, reader: str, lines: Iterable[tuple[float, bytes]], draw: random.Random
+) -> Iterator[tuple[float, bytes]]:
+    step_s = 0.016 if reader == "each 16 ms" else 0.001
     due_s, since_s, waiting = START_S, 0.0, b""
     for time_s, line in lines:
-        if case.reader == "whole scans":  # as a reader does that sleeps until the last byte of a scan
+        if reader == "whole scans":  # as a reader does that sleeps until the last byte of a scan
             if waiting and time_s - since_s > 0.02:
-                yield waiting, since_s + 0.02
+                yield since_s + 0.02, waiting
                 waiting = b""
             since_s = since_s if waiting else time_s
             waiting += line
             if len(waiting) >= scans.bytes_until_scan():
-                yield waiting, time_s + draw.uniform(0.0001, 0.0008)
+                yield time_s + draw.uniform(0.0001, 0.0008), waiting
                 waiting = b""
             continue
         if time_s > due_s:
             if waiting:
-                yield waiting, due_s
+                yield due_s, waiting
             due_s, waiting = due_s + step_s * (1 + int((time_s - due_s) / step_s)), b""
         waiting += line
     if waiting:
-        yield waiting, due_s + step_s
-
-
-def cases() -> list[Case]:
-    """Return all cases."""
-    made = [Case(stamps, lost, reader) for stamps, lost, reader in product((None, *STAMPS), FAULTS, READERS)]
-    made += [Case(stamps, lost, "each ms", n) for stamps in (None, "good") for lost in FAULTS for n in (2, 4)]
-    made += [Case(stamps, lost, "each ms", 1, hz) for stamps in (None, "good") for lost in FAULTS for hz in (10, 400)]
-    return made
-
-
-def main() -> int:
-    """Run the command line; returns the exit code."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--scans", type=int, default=20_000)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="report to write")
-    parser.add_argument("words", nargs="*", metavar="WORD")
-    asked = parser.parse_args()
-    chosen = [case for case in cases() if all(word in str(case) for word in asked.words)]
-    rows, mixed = list[str](), 0
-    with ProcessPoolExecutor() as pool:
-        played = [pool.submit(play, case, asked.scans // case.sensors, asked.seed) for case in chosen]
-        for case, found in zip(chosen, (one.result() for one in played), strict=True):
-            mixed += found.mixed
-            print(f"{case}: {found}", flush=True)
-            of = f"{case.sensors} at {case.rate_hz:g} Hz"
-            counts = (found.cycles, found.whole, found.mixed, found.torn, found.missed, found.late)
-            cells = (case.stamps or "none", case.lost, case.reader, of, *counts, f"{found.lag_ms:.0f}")
-            rows.append(f"| {' | '.join(map(str, cells))} |")
-    if asked.out is not None:
-        command = " ".join(["python tests/support/wire_faults.py", *sys.argv[1:]])
-        head = str(provenance(command, [__file__, "firmware_bridge/scans"], seed=asked.seed))
-        asked.out.write_text("\n".join(["# Scans of a faulty wire", "", head, "", _ABOUT, *rows]) + "\n")
-    return int(mixed > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        yield due_s + step_s, waiting

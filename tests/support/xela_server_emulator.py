@@ -24,39 +24,27 @@ from websockets.exceptions import ConnectionClosed
 
 from firmware_bridge.emulation.slcan_emulator import playing_rate_hz
 from firmware_bridge.errors import LinkLostError
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.xela_server_messages import WELCOME
 
 UNIX_S: Final = 1_768_365_606.25
 MS: Final = 1_000_000
-VERSIONS: Final = ("1.7.6", "1.7.7", "1.8.0")
 
 
 class VendorServer:
-    """Model of a server with some sensors: its readings at any time, in the format of its version."""
+    """Model of a server with sensors that play recordings: its message at any time."""
 
     def __init__(
-        self,
-        recordings: Sequence[Recording],
-        *,
-        version: str = "1.8.0",
-        loop: bool = False,
-        others: Sequence[tuple[str, int]] = (),
+        self, recordings: Sequence[Recording], *, loop: bool = False, others: Sequence[tuple[str, int]] = ()
     ) -> None:
-        """Prepare to play.
+        """Prepare to play each track as a sensor, over and over where it is to loop.
 
-        Args:
-            recordings: each track is one sensor.
-            version: one of VERSIONS.
-            loop: True to begin again after the last cycle.
-            others: model and number of taxels of sensors other than 4x4 ones, after all the others.
+        `others` are model and number of taxels of sensors other than 4x4 ones, after all the others.
         """
-        self._version = version
         self._loop = loop
-        self._others = tuple(others)
+        self._others = [sensor_entry(model=model, taxels=taxels) for model, taxels in others]
         self._sensors = [
-            (track.counts.reshape(len(track.counts), 3, -1), playing_rate_hz(recording, track, None))
+            (track.counts, playing_rate_hz(recording, track, None))
             for recording in recordings
             for track in recording.tracks
         ]
@@ -65,49 +53,15 @@ class VendorServer:
         """Return True once every cycle of every sensor could be sent."""
         return not self._loop and all(elapsed_s * rate_hz >= len(counts) for counts, rate_hz in self._sensors)
 
-    def welcome(self, unix_s: float) -> str:
-        """Return the greeting."""
-        return json.dumps({"message": WELCOME, "time": unix_s, "version": self._version})
-
     def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
         """Return the message on all sensors at a time in [s] from its start, `unix_s` [s] on its own clock."""
-        message: dict[str, Any] = {
-            "message": sequence,
-            "time": unix_s,
-            "sensors": len(self._sensors) + len(self._others),
-            "type": "welcome" if self._version == "1.7.7" else "routine",
-            "version": self._version,
-        }
-        for index in range(len(self._sensors)):
-            message[str(index + 1)] = self._sensor(index, elapsed_s, unix_s)
-        for index, (model, taxels) in enumerate(self._others, len(self._sensors) + 1):
-            data = ",".join(["8000"] * 3 * taxels)
-            message[str(index)] = {"sensor": str(index), "data": data, "model": model, "taxels": taxels, "ups": [58.0]}
-        message["sendtime" if self._version == "1.8.0" else "complete"] = unix_s
-        return json.dumps(message)
-
-    def _sensor(self, index: int, elapsed_s: float, unix_s: float) -> dict[str, Any]:
-        played, rate_hz = self._sensors[index]
-        # A message that is sent at the time of a cycle holds it, however that time was rounded.
-        cycle = int(elapsed_s * rate_hz + 1e-6)
-        counts = played[cycle % len(played) if self._loop else min(cycle, len(played) - 1)].T
-        values = counts.ravel().tolist()
-        by_hex = ",".join(f"{value:04X}" for value in values)
-        rest = played[0].T
-        newtons_per_count = np.array([0.0007, 0.0007, 0.00085])  # about those of real sensors
-        message: dict[str, Any] = {
-            "time": unix_s - elapsed_s % (1 / rate_hz),
-            "sensor": str(index + 1),
-            "data": values if self._version == "1.7.7" else by_hex,
-            "model": "uSPa44",
-            "taxels": USPA44.taxel_count,
-            "calibrated": np.round((counts - rest) * newtons_per_count, 6).ravel().tolist(),
-            "temp": [302.5 if self._version == "1.8.0" else 0.0] * USPA44.taxel_count,
-            "ups": [round(rate_hz, 2)] * USPA44.taxel_count,
-        }
-        if self._version == "1.8.0":
-            message["integer"] = values
-        return message
+        entries: list[dict[str, Any]] = []
+        for played, rate_hz in self._sensors:
+            # A message that is sent at the time of a cycle holds it, however that time was rounded.
+            cycle = int(elapsed_s * rate_hz + 1e-6)
+            counts = played[cycle % len(played) if self._loop else min(cycle, len(played) - 1)]
+            entries.append(sensor_entry(counts, ups=float(rate_hz), time_s=unix_s - elapsed_s % (1 / rate_hz)))
+        return message(sequence, *entries, *self._others, time_s=unix_s)
 
 
 HOST: Final = "127.0.0.1"  # this machine alone, so that no other one takes its messages for a sensor's
@@ -193,7 +147,7 @@ class ServerEmulator:
     async def _attend(self, client: ServerConnection) -> None:
         """Greet a client, and drop what it sends."""
         with suppress(ConnectionClosed):
-            await client.send(self._vendor.welcome(time.time()))
+            await client.send(json.dumps({"message": WELCOME, "time": time.time(), "version": "1.8.0b_208601"}))
             self._clients.add(client)
             self._greeted.set()
             async for _ in client:

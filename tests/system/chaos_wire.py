@@ -332,7 +332,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         faults = stretches(options.faults, options.seed)
     except ValueError as error:
         parser.error(str(error))
-    frames = bus_timeline(played, jitter_s=0.001, seed=options.seed, loop=True)
+    frames = bus_timeline(played, loop=True)
     bus = FaultyBus(numbered(frames), faults, options.seed, options.link)
     try:
         with EmulatorThread([bus]):

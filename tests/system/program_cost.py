@@ -45,11 +45,11 @@ class CostError(Exception):
 class Cost(NamedTuple):
     """Cost of a round; times in [us], None where records are not read or scans were lost."""
 
-    cpu_percent: float
+    cpu_percent: float | None
     p50_us: float | None
     p99_us: float | None
-    lost: int
-    resident_mb: float
+    lost: float | None
+    resident_mb: float | None
 
 
 class Program:
@@ -186,32 +186,6 @@ def _recording(path: Path, number: int, *, pressed: bool) -> Path:
     return path
 
 
-class Ratio(NamedTuple):
-    """Ratio of two medians, and its 95 % interval."""
-
-    ratio: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        shown = [f"{float(f'{value:.3g}'):g}" for value in self]
-        return f"{shown[0]} ({shown[1]}..{shown[2]})"
-
-
-def ratio_of(over: Sequence[float], under: Sequence[float]) -> Ratio:
-    """Return the ratio of the medians of two measurements' blocks, of which those of one place belong together.
-
-    The interval is that of 2000 resamples of the blocks. Raises ValueError for no blocks, or not as many of both.
-    """
-    above, below = np.asarray(over, dtype=np.float64), np.asarray(under, dtype=np.float64)
-    if not len(above) or len(above) != len(below):
-        raise ValueError(f"{len(above)} blocks over {len(below)}, expected some, and as many of both")
-    drawn = np.random.default_rng(0).integers(len(above), size=(2000, len(above)))
-    ratios = np.median(above[drawn], axis=1) / np.median(below[drawn], axis=1)
-    low, high = np.quantile(ratios, (0.025, 0.975)).tolist()
-    return Ratio(float(np.median(above) / np.median(below)), low, high)
-
-
 def show(sensors: int, against: str | None, round_s: float) -> None:
     """Measure the program, in turn with another commit where one is named, and print a line for each part of both."""
     with tempfile.TemporaryDirectory() as name:
@@ -224,7 +198,13 @@ def show(sensors: int, against: str | None, round_s: float) -> None:
             for tree, rounds in costs.items():
                 print(f"{part}, {sensors} sensors, {tree}: {_cells(rounds)}")
             if against is not None:
-                print(f"{part}, ratio of now to {against}: {_ratios(costs['now'], costs[against])}")
+                pairs = zip(costs["now"], costs[against], strict=True)
+                print(f"{part}, now over {against}: {_cells([ratio(*pair) for pair in pairs])}")
+
+
+def ratio(one: Cost, other: Cost) -> Cost:
+    """Return the ratios of two rounds, where both have a figure."""
+    return Cost(*(above / below if above and below else None for above, below in zip(one, other, strict=True)))
 
 
 def _cells(rounds: Sequence[Cost]) -> str:
@@ -235,17 +215,6 @@ def _cells(rounds: Sequence[Cost]) -> str:
         if known:
             middle, low, high = (f"{value:.4g}" for value in (known[len(known) // 2], known[0], known[-1]))
             cells.append(f"{name} {middle} ({low} to {high})")
-    return ", ".join(cells)
-
-
-def _ratios(costs: Sequence[Cost], others: Sequence[Cost]) -> str:
-    """Return the ratios of both trees' rounds, where each was measured."""
-    cells: list[str] = []
-    for name in Cost._fields[:3]:
-        pairs = [(getattr(one, name), getattr(other, name)) for one, other in zip(costs, others, strict=True)]
-        both = [pair for pair in pairs if None not in pair]
-        if both:
-            cells.append(f"{name} {ratio_of(*zip(*both, strict=True))}")
     return ", ".join(cells)
 
 
