@@ -23,11 +23,11 @@ from firmware_bridge.schedule import LINK_SILENT_S
 SourceKind = Literal["device", "replay", "emulated"]
 NoticeKind = Literal["lost", "silent", "back", "trouble", "well", "note"]
 
-RETRY_S: Final = 0.5
-"""Pause between two tries to open a lost link, in [s]: with the opening, one that is back is used within 1 s."""
-RAREST_S: Final = 30.0
-"""Longest time between two openings of a silent link, in [s], which double up to it: at each, some adapters write that
-time stamps are on into an EEPROM, which wears."""
+SOON_RETRY_S: Final = 0.5
+"""Pause between tries in the first minute, in [s]: with the opening, a link that is back is used within 1 s."""
+LATE_RETRY_S: Final = 2.0
+SOON_S: Final = 60.0
+"""Time of an outage with frequent tries, in [s]; later ones are rarer, to save the robot's processor."""
 
 _Answer = TypeVar("_Answer")
 
@@ -289,7 +289,7 @@ class LinkReader:
             raise LinkLostError(
                 f"{name} gave no scan for {self._away_s():.0f} s: check the sensor's power and its cable"
             )
-        self._silent_s += min(self._silent_s, RAREST_S)
+        self._silent_s += min(self._silent_s, LATE_RETRY_S)
         self.__exit__()
 
     def _lose(self, why: str) -> None:
@@ -309,7 +309,7 @@ class LinkReader:
         """Open the link again: at once if it was silent, after a pause if it was lost."""
         self.__exit__()
         if self._away:
-            if self._sleep(RETRY_S):
+            if self._sleep(SOON_RETRY_S if self._away_s() < SOON_S else LATE_RETRY_S):
                 return
             self._received_ns, self._silent_s = self._clock_ns(), LINK_SILENT_S  # its silence begins with the opening
         try:

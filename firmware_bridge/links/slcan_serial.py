@@ -42,6 +42,9 @@ QUIET_S: Final = 0.02
 """Silence after which the line counts as quiet, in [s]: a little over the 16 ms for which an FTDI chip holds bytes."""
 LONGEST_SETTLE_S: Final = 0.3
 
+MOST_SILENT_OPENINGS: Final = 10
+"""Openings in a row without a scan after which stamps are not requested: a lasting link may reopen for days."""
+
 MOST_BYTES: Final = 65536  # most bytes read at once: as many as a kernel keeps for a serial port
 BYTE_S: Final = 5e-6  # time in [s] for a byte of a frame's line, of which a frame of 0.13 ms has 26 at most
 SHORTEST_SLEEP_S: Final = 0.0003
@@ -125,6 +128,7 @@ class SlcanSerialLink(Link):
     Opening sends close, bitrate, time stamps on and open, and waits for no acknowledgement, since some
     adapters never send one. What arrives before the line falls silent is older than the opening and dropped.
     Closing sends close and time stamps off: some adapters keep that setting, and not every program expects stamps.
+    They keep it in an EEPROM, which wears, so a bus that stays silent is not asked for stamps at every opening.
 
     It may be opened any number of times. An adapter with a USB serial number is then recognised under any
     name of its port.
@@ -154,6 +158,9 @@ class SlcanSerialLink(Link):
         self._scans = SlcanScans(model)
         self._scan_ns, self._answers_at_scan = 0, 0
         self._asked_ns: int | None = None
+        self._stamps_on = False
+        self._silent_openings = 0
+        self._frames_at_opening = 0
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._counts = {"received_bytes": 0, "dropped_bytes": 0}
         self._unread = Unread()
@@ -180,7 +187,7 @@ class SlcanSerialLink(Link):
             return
         self._drop_fetched()
         with suppress(*_PORT_ERRORS):  # gone already: no adapter to stop
-            _send(port, *((CLOSE, STAMPS_OFF) if self._asks_stamps else (CLOSE,)))
+            _send(port, *((CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,)))
             self._counts["dropped_bytes"] += len(reader.take()[0])  # pyserial's next opening would not count them
         with suppress(*_PORT_ERRORS):
             if port.out_waiting:  # bytes that a dead device does not accept would delay the closing
@@ -207,10 +214,13 @@ class SlcanSerialLink(Link):
             self._scan_ns, self._answers_at_scan, self._asked_ns, self.trouble = now_ns, answers, None, None
         else:
             self._ask_in_silence(self._serial, now_ns)
-        if self._asks_stamps and self._scans.clock.dropped:
+        if self._stamps_on and self._scans.clock.dropped:
             self.stamps_dropped = True
-            self._asks_stamps = False
-            self._open_without_stamps(self._serial)
+            self._asks_stamps = self._stamps_on = False
+            self._open_anew(self._serial, STAMPS_OFF)
+        elif scans and self._asks_stamps and not self._stamps_on:  # switched off while no scan came
+            self._stamps_on = True
+            self._open_anew(self._serial, STAMPS_ON)
         return scans
 
     def _ask_in_silence(self, port: serial.Serial, now_ns: int) -> None:
@@ -267,15 +277,19 @@ class SlcanSerialLink(Link):
         return port
 
     def _start(self, port: serial.Serial) -> None:
-        _send(port, *((CLOSE, BITRATE_1M, STAMPS_ON) if self._asks_stamps else (CLOSE, BITRATE_1M)))
+        frames = self._scans.decoder.frames
+        self._silent_openings = 0 if frames > self._frames_at_opening else self._silent_openings + 1
+        self._frames_at_opening = frames
+        self._stamps_on = self._asks_stamps and self._silent_openings <= MOST_SILENT_OPENINGS
+        _send(port, *((CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M)))
         self._reader = PortReader(port.fileno())
         self._drop_old_bytes(self._reader)
         _send(port, OPEN, *map(encode_frame, self._triggers))
 
-    def _open_without_stamps(self, port: serial.Serial) -> None:
-        """Open the channel again without time stamps, on a quiet line: of two forms at once most would be lost."""
+    def _open_anew(self, port: serial.Serial, stamps: bytes) -> None:
+        """Reopen the channel with time stamps on or off, on a quiet line: of two forms at once most would be lost."""
         with suppress(*_PORT_ERRORS):  # gone, which the next read reports, or full: then no answer would come
-            _send(port, CLOSE, STAMPS_OFF)
+            _send(port, CLOSE, stamps)
             if self._reader is not None:
                 self._drop_old_bytes(self._reader)
         self._begin_anew()

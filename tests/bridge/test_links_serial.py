@@ -316,3 +316,28 @@ def read_now(device: SilentDevice) -> bytes:
         return os.read(device.device_fd, 1000)
     except BlockingIOError:
         return b""
+
+
+def test_stamps_are_not_asked_for_for_ever_where_nothing_comes(limits):
+    """Some adapters write the setting to an EEPROM each time."""
+    limits(slcan_serial, MOST_SILENT_OPENINGS=2, QUIET_S=0.001)
+    stamped, plain = b"C\rS8\rZ1\rO\rC\rZ0\r", b"C\rS8\rO\rC\r"
+    with SilentDevice() as device:
+        link = SlcanSerialLink(device.port)
+        for expected in (stamped, stamped, plain, plain):
+            with link:
+                pass
+            assert device.received(len(expected)) == expected
+        with link:
+            assert device.received(7) == b"C\rS8\rO\r"
+            os.write(device.device_fd, b"".join(cycle_lines(0)))
+            read_scans(link, 1)
+            assert device.received(7) == b"C\rZ1\rO\r"
+            wait_for(lambda: link.read(0.0) == [])
+            os.write(device.device_fd, b"".join(line for n in range(1, 9) for line in cycle_lines(n, 10 * n)))
+            scans = read_scans(link, 8)
+            assert all(scan.whole and scan.device_ns is not None for scan in scans), "no line of the new form is lost"
+        assert device.received(5) == b"C\rZ0\r", "asked for once"
+        with link:
+            pass
+        assert device.received(len(stamped)) == stamped
