@@ -4,7 +4,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter
 from typing import Final
 
 from edge.perception.event import Event, EventKind
@@ -20,7 +19,6 @@ COUNTED: Final = (
     *("poses", "poses_refused", "poses_dropped", "unwritten"),
 )
 """Counts of which records have counters."""
-counts_of: Final = attrgetter(*COUNTED)  # function from statistics to these counts
 
 
 class Histogram:
@@ -92,7 +90,7 @@ class Statistics:
 
     def counters(self) -> dict[str, int]:
         """Return the counts of which records have counters."""
-        return dict(zip(COUNTED, counts_of(self), strict=True))
+        return {name: getattr(self, name) for name in COUNTED}
 
     def add(self, result: Result) -> None:
         """Count one result."""
