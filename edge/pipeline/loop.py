@@ -280,7 +280,6 @@ class Loop:
         statistics.late, statistics.missed = self._cadences.late, self._cadences.missed
         statistics.poses, statistics.poses_refused = self._intake.used, poses.refused
         statistics.poses_dropped = poses.dropped
-        statistics.commands_refused = self._commands.refused
         if self._sinks:  # those of a closed stream have told theirs
             statistics.unwritten = sum(sink.unwritten for sink in self._sinks)
         return self._source.counters() | statistics.counters()

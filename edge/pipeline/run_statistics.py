@@ -9,7 +9,6 @@ from typing import Final
 from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from firmware_bridge.errors import as_typed
-from firmware_bridge.zeroing.drift_tracker import Drift
 
 BUCKETS_PER_OCTAVE: Final = 32  # a quantile is at most 2.2 % too high
 STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
@@ -75,10 +74,6 @@ class Statistics:
     overruns: int = 0  # scans discarded unread because nobody took them in time
     missed: int = 0  # scans that never arrived, as far as gaps show
     unwritten: int = 0  # records left out for readers that were too slow
-    torn_wire: int = 0  # scans with taxels missing
-    torn_source: int = 0  # complete scans that were only partly renewed
-    repeated: int = 0  # complete scans with nothing renewed
-    commands_refused: int = 0  # lines on stdin, and messages of viewers, that were not commands
     poses: int = 0
     poses_refused: int = 0
     poses_dropped: int = 0
@@ -98,10 +93,6 @@ class Statistics:
         self.source = result.source
         self.scans += 1
         self.dropped += result.state == "dropped"
-        if not scan.whole:
-            self.torn_wire += not scan.complete
-            self.torn_source += scan.complete and scan.torn
-            self.repeated += scan.repeated
         self.patterns += result.pattern is not None
         self.reused += result.reused_from is not None
         if result.run_time_us is not None:
@@ -142,8 +133,7 @@ class Statistics:
         """Return the run in a few lines, with the source as the user names it, and the requested rate."""
         lines = [
             f"{source}: {self.scans} scans, {self.patterns} patterns ({self.reused} reused), {self.dropped} dropped, "
-            f"{self.overruns} overrun, {self.missed} missed",
-            f"torn: {self.torn_wire} on the wire, {self.torn_source} renewed in part; {self.repeated} repeated",
+            f"{self.overruns} overrun, {self.missed} missed"
         ]
         late = f", {self.late} later than a period" if self.late else ""
         for name, times, more in (("run time", self.run_time_us, ""), ("scan to pattern", self.latency_us, late)):
@@ -161,7 +151,7 @@ class Statistics:
             wanted = f", {wanted_rate_hz:g} Hz asked for" if wanted_rate_hz is not None else ""
             lines.append(f"rate held: {', '.join(rates)}{wanted}")
         lines += [
-            f"sensor {name}: {result.baseline_text()}, from {result.baseline.origin}{_drift_text(result.drift)}"
+            f"sensor {name}: {result.baseline_text()}, from {result.baseline.origin}"
             for name, course in sorted(self._sensors.items())
             if (result := course.zeroed) is not None and result.baseline is not None
         ]
@@ -175,11 +165,6 @@ class Statistics:
             lines.append(f"records left out for slow readers: {self.unwritten}")
         if self.sink_trouble:
             lines.append(f"sinks: {self.sink_trouble}")
-        if self.events:
-            counts = ", ".join(f"{kind} {count}" for kind, count in self.events.items())
-            lines.append(f"events: {counts}")
-        if self.commands_refused:
-            lines.append(f"refused: {self.commands_refused} lines or messages were not commands")
         return "\n".join(lines)
 
     def _without_pattern(self) -> list[str]:
@@ -200,13 +185,6 @@ class Statistics:
             if why is not None:
                 lines.append(f"sensor {name} has no pattern{believed}: {why}")
         return lines
-
-
-def _drift_text(drift: Drift | None) -> str:
-    if drift is None or round(max(map(abs, drift.common_counts))) == 0:
-        return ""
-    x, y, z = drift.common_counts
-    return f"; drifted since by x {x:.0f}, y {y:.0f}, z {z:.0f} counts"
 
 
 _MESSAGES: Final = {
