@@ -125,16 +125,6 @@ function outlinePad(context, ink, width, height, pxPerMm, next) {
   context.restore();
 }
 
-function thumb(tap) {
-  const item = document.createElement("li");
-  const canvas = item.appendChild(document.createElement("canvas"));
-  [canvas.width, canvas.height] = [4, 4];
-  canvas.setAttribute("role", "img");
-  canvas.setAttribute("aria-label", tap === 0 ? "this tap" : `${tap} taps before`);
-  item.append(tap === 0 ? "now" : `${MINUS}${tap}`);
-  return item;
-}
-
 const LEAST_COUNTS = 200; // so that noise at rest stays dark
 
 // ---- Marks over the pattern and the taxels ----
