@@ -311,4 +311,4 @@ class TestDeadline:
         assert [counters["late"] for counters in sink.counters] == [0] * 7 + [1, 2, 3]
         assert ["late" in [note.kind for note in result.notes] for result in sink.results] == [False] * 9 + [True]
         assert "this pattern was ready 0.29 s after its newest reading arrived" in (sink.results[9].note or "")
-        assert statistics.late == 3 and statistics.latency_us.count == 10 and statistics.dropped == 0
+        assert statistics.late == 3 and len(statistics.latency_us) == 10 and statistics.dropped == 0

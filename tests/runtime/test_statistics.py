@@ -6,13 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from edge_samples import BASELINE, ROOT, make_scan
-from hypothesis import given
-from hypothesis import strategies as st
 from runtime_samples import Pushed
 
 from edge.perception.event import KINDS, NOTE_KINDS, Event, Note, joined
 from edge.perception.result import Result
-from edge.pipeline.run_statistics import Histogram, Statistics
+from edge.pipeline.run_statistics import Statistics
 
 
 def result(scan, state="idle", run_time_us=None, **more):
@@ -41,24 +39,6 @@ def test_which_baseline_and_how_old(age_s, age):
     known = result(make_scan(), baseline=BASELINE, baseline_age_s=age_s)
     assert known.baseline_text() == f"baseline {BASELINE.id} {age} old"
     assert result(make_scan()).baseline_text() == "no baseline"
-
-
-class TestHistogram:
-    @given(st.lists(st.floats(1, 1e7), min_size=1, max_size=200), st.floats(0.01, 1))
-    def test_quantiles_are_at_most_one_bucket_too_high(self, values, share):
-        histogram = Histogram()
-        for value in values:
-            histogram.add(value)
-        exact = float(np.quantile(values, share, method="inverted_cdf"))
-        got = histogram.quantile(share)
-        assert got is not None and exact * (1 - 1e-9) <= got <= exact * 1.0219
-        assert got <= histogram.max == max(values)
-
-    def test_extreme_values_stay_within(self):
-        histogram = Histogram()
-        for value in (0.0, 1e-9, 1e30):
-            histogram.add(value)
-        assert histogram.count == 3 and histogram.max == 1e30 and histogram.quantile(0.5) == 1.0
 
 
 class TestSummary:
