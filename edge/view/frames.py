@@ -239,7 +239,6 @@ def hello(source: Source, model: str, contract: Contract) -> bytes:
         "taps": contract.taps,
         "pattern_unit": contract.output_unit,
         "full_scale": contract.output_full_scale,
-        "contact_level": contract.contact_level,
         "pixel_pitch_mm": contract.pitch_mm / contract.scale,
         "taxel_pitch_mm": contract.pitch_mm,
         "rows": contract.rows,

@@ -132,7 +132,6 @@ def test_a_recording_begins_when_its_page_is_opened_and_ends(demo, tmp_path, ope
             word(page, "contact", sensor)
         playwright.expect(page.locator("#about")).to_contain_text("replay:4.csv,6.csv")
         playwright.expect(number(page, "missed")).to_have_text("0")
-        playwright.expect(number(page, "ellipse")).to_have_text(re.compile("^\\d+\\.\\d \u00d7 \\d+\\.\\d\\smm$"))
         playwright.expect(part(page, "link")).to_contain_text("scans/s")
         word(page, "idle")
         word(page, "run ended")

@@ -154,8 +154,6 @@ class Sensor {
     return known(own) ? amount(own, 2, "N") : `${amount(nominal(this.result?.force_counts), 2, "N")} nominal`;
   }
 
-  ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, page.hello.pixel_pitch_mm, page.hello.contact_level); }
-
   word() {
     if (!page.link.up) return ["lost", lostWord()];
     if (this.result === null) return ["silent", this.silentS === null ? "no scan yet" : "no scan"];
@@ -304,9 +302,8 @@ class Sensor {
     const made = this.made();
     if (result === null) return;
     const counters = result.counters ?? {};
-    const ellipse = made.state === "contact" && made.trusted !== false && this.newest() ? this.ellipse() : null;
     for (const [key, { element, text }] of Object.entries(this.fields)) {
-      say(element, text?.({ sensor: this, result, made, ellipse }) ?? String(counters[key] ?? 0));
+      say(element, text?.({ sensor: this, result, made }) ?? String(counters[key] ?? 0));
       // Fewer losses, as in the first second of a run, are no reason to worry.
       if (!text) element.classList.toggle("warn", counters[key] > 0.01 * (counters.scans ?? 0));
     }
