@@ -1,7 +1,6 @@
-"""Sources of poses beside stdin, by the names that a user writes: zenoh, and ROS 2 with no ROS installed.
+"""Poses of the pad from ROS 2, with no ROS installed, into the queue of poses of `edge/pipeline/pose_queue.py`.
 
-They steer nothing else, and put what they receive into the queue of poses: `edge/pipeline/pose_queue.py`, which parses
-JSON, that of stdin, too. docs/poses.md draws how a stamped pose of a tool frame becomes a pad's in an object's plane.
+docs/poses.md draws how a stamped pose of a tool frame becomes a pad's in an object's plane.
 """
 
 import os
@@ -10,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from math import acos, atan2, degrees, hypot, isfinite, sqrt
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,71 +18,28 @@ from edge.errors import UsageError
 from edge.pipeline.pose_queue import PoseError, PoseQueue
 from edge.sinks.registry import needs_cyclone_dds
 from edge.sinks.ros2.messages import TYPES, base_topic
-from edge.sinks.zenoh import close_session, open_session, opening, parsed_target
 from firmware_bridge.errors import CdrError
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose, TimedPose
 from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.scans.device_clock import DeviceClock
 
-if TYPE_CHECKING:
-    import zenoh
 
-FORMS: Final = ("zenoh[:KEY]", "ros2:TOPIC")
-
-
-class PoseSource(Protocol):
-    """Open source of poses, which receives in a thread of its own until it is closed."""
-
-    def close(self) -> None:
-        """End it."""
+def check_poses(text: str) -> tuple[str | None, str]:
+    """Return sensor and topic of the source of poses that `text` names, or raise a UsageError."""
+    match = re.fullmatch(r"(?:([A-Za-z0-9_/-]{1,64})=)?ros2:(.+)", text, re.DOTALL)
+    if match is None:
+        raise UsageError(f"no source of poses {text!r}: expected ros2:TOPIC, or SENSOR=ros2:TOPIC")
+    return match[1], base_topic(match[2])
 
 
-def check_poses(text: str) -> tuple[str | None, str, str]:
-    """Return sensor, form and target of the source that `text` names, FORM or SENSOR=FORM, or raise a UsageError."""
-    match = re.fullmatch(r"([A-Za-z0-9_/-]{1,64})=(.+)", text, re.DOTALL)
-    sensor, form_text = (match[1], match[2]) if match else (None, text)
-    form, _, target = form_text.partition(":")
-    if form == "zenoh":
-        target = target or "pose"
-        parsed_target(target)
-    elif form == "ros2" and target:
-        target = base_topic(target)
-    else:
-        raise UsageError(f"no source of poses {text!r}; they are {', '.join(FORMS)}, or SENSOR= before one of them")
-    return sensor, form, target
-
-
-def open_poses(text: str, queue: PoseQueue) -> PoseSource:
+def open_poses(text: str, queue: PoseQueue) -> "PoseSource":
     """Open the source of poses that `text` names, as for `check_poses`; they go to the queue.
 
-    Raises a UsageError where a package is not installed, and a SinkError where it cannot be opened.
+    Raises a UsageError where Cyclone DDS is not installed, and a SinkError where its domain cannot be joined.
     """
-    sensor, form, target = check_poses(text)
-    if form == "zenoh":
-        return ZenohPoses(target, queue, sensor)
+    sensor, topic = check_poses(text)
     with needs_cyclone_dds(text):
-        return Ros2Poses(target, queue, sensor)
-
-
-class ZenohPoses:
-    """Subscriber to a key of poses, the same JSON as on stdin, one a message; `sensor` is that of those with none."""
-
-    def __init__(self, target: str, queue: PoseQueue, sensor: str | None) -> None:
-        """Open a session; it does not matter whether a publisher is there, now or later."""
-        key, self._session = open_session(target)
-        import zenoh
-
-        def take(sample: "zenoh.Sample") -> None:
-            queue.put_json(sample.payload.to_bytes(), time.monotonic_ns(), sensor)
-
-        with opening():
-            # In zenoh's thread, since a thread in between would add its own delay to a time of arrival.
-            called = zenoh.handlers.Callback(take, indirect=False)
-            self._subscriber = self._session.declare_subscriber(key, called)
-
-    def close(self) -> None:
-        """End the session."""
-        close_session(self._session)
+        return PoseSource(topic, queue, sensor)
 
 
 _KEPT: Final = 128  # messages of a topic that wait until they are read
@@ -166,7 +122,7 @@ class StampClock:
         return by_arrivals_ns
 
 
-class Ros2Poses:
+class PoseSource:
     """Subscriber in a thread of its own, whose poses go to the queue as they come."""
 
     def __init__(self, topic: str, queue: PoseQueue, sensor: str | None = None) -> None:

@@ -93,8 +93,8 @@ RUN: Final = (
                "start)"),
         Option("--give-up-s T", not_negative, "end when the source has been lost for T seconds; 0: at once "
                "(default: never)"),
-        Option("--poses P", list, "positions of the pad, which a robot sends: zenoh[:KEY] or ros2:TOPIC; for one of "
-               "several sensors SENSOR=P; repeat it for several"),
+        Option("--poses P", list, "positions of the pad, which a robot sends: ros2:TOPIC; for one of several "
+               "sensors SENSOR=P; repeat it for several"),
     ),
     *RESULTS,
 )

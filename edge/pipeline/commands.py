@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -188,7 +187,8 @@ KEYS: Final = {ord("r"): RESET, ord("z"): ZERO, ord("Z"): Command("zero", force=
 def terminal_keys(commands: Commands) -> Iterator[None]:
     """Take keys as commands within a with statement, if stdin is a terminal; Ctrl-C and Ctrl-Z remain signals.
 
-    A shell restores the terminal itself after a program that a signal has ended or stopped.
+    A shell restores the terminal itself after a program that a signal has ended or stopped, and gives it back without a
+    signal: each look sets it for keys again where it is set for lines.
     """
     if os.name != "posix" or sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
         yield
@@ -197,35 +197,27 @@ def terminal_keys(commands: Commands) -> Iterator[None]:
     import tty
 
     descriptor = sys.stdin.fileno()
-    commands.ask(partial(_read_keys, commands, descriptor))
 
-    def pass_keys(*_: object) -> None:
-        with suppress(termios.error):  # the terminal was closed, which ends keys but not the run
+    def take_keys() -> None:
+        with suppress(OSError, termios.error):  # the terminal was closed, which ends keys but not the run
             if _in_front(descriptor):
-                tty.setcbreak(descriptor, termios.TCSANOW)
+                if termios.tcgetattr(descriptor)[3] & termios.ICANON:
+                    tty.setcbreak(descriptor, termios.TCSANOW)
+                if select.select([descriptor], [], [], 0)[0]:
+                    for key in os.read(descriptor, 64):
+                        if key in KEYS:
+                            commands.put(KEYS[key])
 
-    with handled(["SIGCONT"], pass_keys):
-        try:
-            before = termios.tcgetattr(descriptor)
-        except termios.error:
-            yield
-            return
-        pass_keys()
-        try:
-            yield
-        finally:
-            with suppress(termios.error):
-                if _in_front(descriptor):
-                    termios.tcsetattr(descriptor, termios.TCSANOW, before)
-
-
-def _read_keys(commands: Commands, descriptor: int) -> None:
-    """Put the commands of the keys pressed since the last call; never waits, and ignores other keys than KEYS."""
-    with suppress(OSError):  # the terminal was closed
-        if _in_front(descriptor) and select.select([descriptor], [], [], 0)[0]:
-            for key in os.read(descriptor, 64):
-                if key in KEYS:
-                    commands.put(KEYS[key])
+    before = None
+    with suppress(termios.error):
+        before = termios.tcgetattr(descriptor)
+        commands.ask(take_keys)
+    try:
+        yield
+    finally:
+        with suppress(termios.error):
+            if before is not None and _in_front(descriptor):
+                termios.tcsetattr(descriptor, termios.TCSANOW, before)
 
 
 def _in_front(descriptor: int) -> bool:

@@ -5,7 +5,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from operator import attrgetter
 from typing import TYPE_CHECKING, Final, Literal
 
 from edge.errors import UsageError
@@ -15,11 +14,10 @@ from edge.perception.runtime import Runtime
 from edge.pipeline.cadence import Cadences
 from edge.pipeline.commands import Commands
 from edge.pipeline.pose_queue import PoseIntake
-from edge.pipeline.run_statistics import Statistics, counts_of
+from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.validation import check_kind, check_positive
-from firmware_bridge.errors import BridgeError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.poses import TimedPose
 from firmware_bridge.scans.scan import Scan
@@ -28,7 +26,6 @@ from firmware_bridge.schedule import NS_PER_S, POLL_S
 if TYPE_CHECKING:
     from edge.pipeline.gain_keeper import GainKeeper
 
-_UNWRITTEN: Final = attrgetter("unwritten")
 LinkState = Literal["up", "silent", "lost", "ended"]
 ALL_HEARD_SCANS: Final = 10  # scans of one sensor of a link after which all sensors of that link have sent some
 
@@ -102,11 +99,10 @@ class Loop:
         refused = "the scans come with poses of their own" if source.states_poses else refused
         self._intake = PoseIntake(runtime, self._poses, refused=refused, unused_by=unused_by)
         self._cadences = Cadences(runtime.expected, recorded=source.kind == "replay", rate_hz=source.rate_hz)
-        self._first_ns: int | None = None
         self._waited_ns = self._refused_ns = -math.inf
         self._clock_ns = clock_ns
         self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
-        self._counted_ns, self._troubles, self._counters = 0, (), dict[str, int]()
+        self._counted_ns, self._losses, self._counters = 0, (), dict[str, int]()
         self._keeper: GainKeeper | None = None
         file = source.sensor_file
         if source.kind != "replay" and file.path is not None:
@@ -123,8 +119,7 @@ class Loop:
     @property
     def counters(self) -> dict[str, int]:
         """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
-        self._tally()
-        return self._source.counters() | self.statistics.counters()
+        return self._count()
 
     def close(self) -> None:
         """End the stream, as closing its source does; its sinks, which may be closed by now, get nothing more."""
@@ -160,60 +155,43 @@ class Loop:
                     raise
 
     def _make(self, wait_s: float) -> None:
-        """Take what waits, and make its results: the order of everything that happens in a turn."""
-        source, runtime, now_ns = self._source, self._runtime, self._clock_ns()
+        """Take what waits and make its results: the order of everything that happens in a turn."""
+        source, runtime, cadences = self._source, self._runtime, self._cadences
+        if self._begun_ns is None and not source.patient:
+            self._begun_ns = self._clock_ns()
+        over = self._stop.is_set()
+        taken = None if over and source.patient else source.take(0.0 if over else wait_s)
+        now_ns = (source.last_ns or 0) if source.patient else self._clock_ns()
         self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
-        over = self._stop.is_set() or (not source.patient and now_ns - self._begun_ns >= self._length_ns)
-        try:
-            more = not (over and source.patient) and self._take(0.0 if over or runtime.waiting else wait_s)
-            due = len(runtime.waiting)
-            while more and due > 0:
-                due -= self._infer()
-                # Scans that come meanwhile join those that wait, but do not prolong what a caller waits for.
-                more = due <= 0 or over or self._take(0.0)
-        except BridgeError:
-            self._make_patterns()
-            raise
-        if over or not more or source.patient:
-            self._make_patterns()
-        if over or not more:
+        over = over or now_ns - self._begun_ns >= self._length_ns
+        if taken is None or (over and source.patient):
             self._finish()
             self._ended = True
             return
-        for event in self._cadences.look():
-            self._tell(event)
-        source.pace = self._cadences.pace
-
-    def _take(self, wait_s: float) -> bool:
-        """Pass on what waits: commands, poses, and scans that are to be followed; False where no more will come."""
-        source, runtime = self._source, self._runtime
-        taken = source.take(wait_s)
-        if taken is None or (source.patient and self._is_too_long()):
-            return False
         for command in self._commands.poll():
             command.carry_out(runtime)
         if self._commands.reason is not None:
             self._tell_refusal(self._commands.reason)
         if self._poses.begun or source.states_poses:
-            self._take_poses(taken)
+            self._take_poses(taken, now_ns)
         for arrival in taken:
             if isinstance(arrival, Scan):
                 for result in runtime.take(arrival, self._latency_clock):
                     self._follow(result)
-                if arrival.time_ns < self._cadences.waited_ns:
+                if arrival.time_ns < cadences.waited_ns:
                     self._make_patterns()
             elif isinstance(arrival, Notice):
                 self._make_patterns()
                 self._take_notice(arrival)
+        self._make_patterns()
         if not taken:
             self._rest(wait_s)
-        return True
-
-    def _is_too_long(self) -> bool:
-        """Return whether the time of a patient source, which is that of its scans, is over."""
-        last_ns = self._source.last_ns
-        self._first_ns = last_ns if self._first_ns is None else self._first_ns
-        return last_ns is not None and self._first_ns is not None and last_ns - self._first_ns >= self._length_ns
+        for event in cadences.look():
+            self._tell(event)
+        source.pace = cadences.pace
+        if over:
+            self._finish()
+            self._ended = True
 
     def _finish(self) -> None:
         """Keep what was learned; there are no more results."""
@@ -221,7 +199,7 @@ class Loop:
             keeper, self._keeper = self._keeper, None
             if (trouble := keeper.close()) is not None:
                 self._tell(Event(self._clock_ns(), "note", None, f"learned gains are not kept: {trouble}"))
-        self._tally()
+        self._count()
         if self._sinks:
             troubles = [sink.trouble for sink in self._sinks if sink.trouble is not None]
             self.statistics.sink_trouble = "; ".join(troubles) or None
@@ -256,11 +234,10 @@ class Loop:
             for sink in self._sinks:
                 sink.wait()
 
-    def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose]) -> None:
+    def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose], now_ns: int) -> None:
         """Pass poses on to the runtime: those from outside, and those of the source."""
         recorded = [pose for pose in taken if isinstance(pose, TimedPose)]
         first_ns = min((scan.time_ns for scan in taken if isinstance(scan, Scan)), default=None)
-        now_ns = (self._source.last_ns or 0) if self._source.patient else self._clock_ns()
         poses = self._intake.take(recorded, first_ns, now_ns, self._no_sensor)
         for sink in self._sinks if poses else ():
             sink.pose(poses)
@@ -268,52 +245,44 @@ class Loop:
             self._tell(event)
 
     def _make_patterns(self) -> None:
-        """Make the results of all sensors that wait for their patterns."""
+        """Make the results of all sensors that wait for their patterns, those that have waited longest first."""
         while self._runtime.waiting:
-            self._infer()
-
-    def _infer(self) -> int:
-        """Make the results of those that have waited longest, in one call; return their number."""
-        results = self._runtime.infer(self._latency_clock)
-        if self._keeper is not None:
-            for name, pad in self._runtime.take_learned().items():
-                self._keeper.keep(name, pad)
-        for result in results:
-            self._follow(result)
-        return len(results)
+            results = self._runtime.infer(self._latency_clock)
+            if self._keeper is not None:
+                for name, pad in self._runtime.take_learned().items():
+                    self._keeper.keep(name, pad)
+            for result in results:
+                self._follow(result)
 
     def _follow(self, result: Result) -> None:
         """Count a result, and hand it on."""
+        scan, statistics = result.scan, self.statistics
         back = self._cadences.follow(result)
-        self.statistics.add(result)
+        statistics.add(result)
         if back is not None:
             self._tell(back)
-        self._tally()
         if self._sinks:
-            # Counters are read where something was lost, else four times a second by the time of the scans: merging
-            # them took a tenth of a scan.
-            scan, troubles = result.scan, counts_of(self.statistics)
-            fresh = 0 <= scan.time_ns - self._counted_ns < 250_000_000
-            if not (fresh and scan.whole and troubles == self._troubles):
-                self._counted_ns, self._troubles = scan.time_ns, troubles
-                self._counters = self._source.counters() | self.statistics.counters()
+            # Counters are read where a scan was lost, else four times a second by the time of the scans: merging them
+            # took a tenth of a scan.
+            losses = statistics.dropped, self._source.overruns, self._cadences.late, self._cadences.missed
+            if not (0 <= scan.time_ns - self._counted_ns < NS_PER_S / 4 and scan.whole and losses == self._losses):
+                self._counted_ns, self._losses, self._counters = scan.time_ns, losses, self._count()
             for sink in self._sinks:
                 sink.write(result, self._counters)
-        name = result.scan.sensor
-        self._newest[name] = result
-        self._unseen[name] = self._unseen.get(name, 0) + 1
+        self._newest[scan.sensor] = result
+        self._unseen[scan.sensor] = self._unseen.get(scan.sensor, 0) + 1
         self._made.append(result)
 
-    def _tally(self) -> None:
-        """Bring the statistics up to date with what is counted elsewhere."""
+    def _count(self) -> dict[str, int]:
+        """Bring the statistics up to date with what is counted elsewhere, and return all counters."""
         statistics, poses = self.statistics, self._poses
         statistics.overruns = self._source.overruns
         statistics.late, statistics.missed = self._cadences.late, self._cadences.missed
         statistics.poses, statistics.poses_refused = self._intake.used, poses.refused
         statistics.poses_dropped = poses.dropped
-        statistics.commands_refused = self._commands.refused
         if self._sinks:  # those of a closed stream have told theirs
-            statistics.unwritten = sum(map(_UNWRITTEN, self._sinks))
+            statistics.unwritten = sum(sink.unwritten for sink in self._sinks)
+        return self._source.counters() | statistics.counters()
 
     def _take_notice(self, notice: Notice) -> None:
         """Forget readings and taps from before an outage, and report the notice as an event."""
@@ -325,7 +294,7 @@ class Loop:
     def _tell(self, event: Event) -> None:
         self.statistics.tell(event)
         if self._sinks:
-            counters = self.counters
+            counters = self._count()
             for sink in self._sinks:
                 sink.tell(event, counters)
         down = (event.sensors, "link") if event.sensor is None else (event.sensor, "sensor")

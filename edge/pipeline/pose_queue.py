@@ -122,14 +122,6 @@ class PoseQueue:
         except PoseError as error:
             self.refuse(error)
 
-    def put_json(self, text: bytes, now_ns: int, sensor: str | None = None) -> None:
-        """Put the pose in a message of JSON, of this sensor if it names none, or refuse it."""
-        parsed = json_object(text)
-        if parsed is None:
-            self.refuse(PoseError("json", f'{text[:40]!a} is not JSON such as {{"x_mm": 1.5, "y_mm": 0}}'))
-        else:
-            self.put_fields(parsed if parsed.get("sensor") is not None else parsed | {"sensor": sensor}, now_ns)
-
     def refuse(self, error: PoseError) -> None:
         """Count a pose that cannot be taken."""
         self.warn(error.reason, f"a pose is refused: {error}", refused=1)

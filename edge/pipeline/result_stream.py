@@ -249,8 +249,7 @@ class Stream(Loop):
         import asyncio
 
         def wait_and_step() -> None:
-            if not self._runtime.waiting:
-                self._source.wait(wait_s)  # not within a step, which another task would have to wait for
+            self._source.wait(wait_s)  # not within a step, which another task would have to wait for
             self._step(0.0)
 
         if self._error is not None:

@@ -1,18 +1,19 @@
 """Statistics of a run, in memory that does not grow with it; and advice to a person whose source gives no scan."""
 
-import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter
+from functools import partial
 from typing import Final
+
+import numpy as np
 
 from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from firmware_bridge.errors import as_typed
-from firmware_bridge.zeroing.drift_tracker import Drift
 
-BUCKETS_PER_OCTAVE: Final = 32  # a quantile is at most 2.2 % too high
+NEWEST: Final = 10_000  # patterns whose times are kept, a hundred seconds of one sensor
+ANSWERS_BYTES: Final = 64  # fewer are the adapter's answers to commands
 STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
 COUNTED: Final = (
@@ -20,32 +21,6 @@ COUNTED: Final = (
     *("poses", "poses_refused", "poses_dropped", "unwritten"),
 )
 """Counts of which records have counters."""
-counts_of: Final = attrgetter(*COUNTED)  # function from statistics to these counts
-
-
-class Histogram:
-    """Histogram of positive numbers with logarithmic buckets, for quantiles."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.max = 0.0
-        self._buckets: dict[int, int] = {}
-
-    def add(self, value: float) -> None:
-        """Count a value; below 1 counts as 1."""
-        self.count += 1
-        self.max = max(self.max, value)
-        bucket = math.ceil(math.log2(max(value, 1.0)) * BUCKETS_PER_OCTAVE)
-        self._buckets[bucket] = self._buckets.get(bucket, 0) + 1
-
-    def quantile(self, share: float) -> float | None:
-        """Return the upper edge of the bucket that holds the `share`-th value; None without values."""
-        left = max(1, math.ceil(share * self.count))
-        for bucket, count in sorted(self._buckets.items()):
-            left -= count
-            if left <= 0:
-                return min(2.0 ** (bucket / BUCKETS_PER_OCTAVE), self.max)
-        return None
 
 
 @dataclass(slots=True)
@@ -77,22 +52,18 @@ class Statistics:
     overruns: int = 0  # scans discarded unread because nobody took them in time
     missed: int = 0  # scans that never arrived, as far as gaps show
     unwritten: int = 0  # records left out for readers that were too slow
-    torn_wire: int = 0  # scans with taxels missing
-    torn_source: int = 0  # complete scans that were only partly renewed
-    repeated: int = 0  # complete scans with nothing renewed
-    commands_refused: int = 0  # lines on stdin, and messages of viewers, that were not commands
     poses: int = 0
     poses_refused: int = 0
     poses_dropped: int = 0
     sink_trouble: str | None = None  # trouble of the sinks at the end; None while all is well
     events: dict[EventKind, int] = field(default_factory=dict)
-    run_time_us: Histogram = field(default_factory=Histogram)
-    latency_us: Histogram = field(default_factory=Histogram)
+    run_time_us: deque[float] = field(default_factory=partial(deque, maxlen=NEWEST))
+    latency_us: deque[float] = field(default_factory=partial(deque, maxlen=NEWEST))
     _sensors: dict[str, _Course] = field(default_factory=dict)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of which records have counters."""
-        return dict(zip(COUNTED, counts_of(self), strict=True))
+        return {name: getattr(self, name) for name in COUNTED}
 
     def add(self, result: Result) -> None:
         """Count one result."""
@@ -100,16 +71,12 @@ class Statistics:
         self.source = result.source
         self.scans += 1
         self.dropped += result.state == "dropped"
-        if not scan.whole:
-            self.torn_wire += not scan.complete
-            self.torn_source += scan.complete and scan.torn
-            self.repeated += scan.repeated
         self.patterns += result.pattern is not None
         self.reused += result.reused_from is not None
         if result.run_time_us is not None:
-            self.run_time_us.add(result.run_time_us)
+            self.run_time_us.append(result.run_time_us)
         if result.latency_us is not None:
-            self.latency_us.add(result.latency_us)
+            self.latency_us.append(result.latency_us)
         course = self._sensors.get(scan.sensor)
         if course is None:
             course = self._sensors[scan.sensor] = _Course(scan.time_ns, result)
@@ -144,14 +111,14 @@ class Statistics:
         """Return the run in a few lines, with the source as the user names it, and the requested rate."""
         lines = [
             f"{source}: {self.scans} scans, {self.patterns} patterns ({self.reused} reused), {self.dropped} dropped, "
-            f"{self.overruns} overrun, {self.missed} missed",
-            f"torn: {self.torn_wire} on the wire, {self.torn_source} renewed in part; {self.repeated} repeated",
+            f"{self.overruns} overrun, {self.missed} missed"
         ]
         late = f", {self.late} later than a period" if self.late else ""
         for name, times, more in (("run time", self.run_time_us, ""), ("scan to pattern", self.latency_us, late)):
-            p50_us, p99_us = times.quantile(0.5), times.quantile(0.99)
-            if p50_us is not None and p99_us is not None:
-                lines.append(f"{name}: p50 {p50_us:.0f} us, p99 {p99_us:.0f} us, max {times.max:.0f} us{more}")
+            if times:
+                p50_us, p99_us = np.quantile(times, (0.5, 0.99))
+                of = f" of the newest {NEWEST}" if len(times) == NEWEST else ""
+                lines.append(f"{name}{of}: p50 {p50_us:.0f} us, p99 {p99_us:.0f} us, max {max(times):.0f} us{more}")
         lines += self._without_pattern()
         rates = [
             f"{rate_hz:.1f} Hz (sensor {name})"
@@ -163,7 +130,7 @@ class Statistics:
             wanted = f", {wanted_rate_hz:g} Hz asked for" if wanted_rate_hz is not None else ""
             lines.append(f"rate held: {', '.join(rates)}{wanted}")
         lines += [
-            f"sensor {name}: {result.baseline_text()}, from {result.baseline.origin}{_drift_text(result.drift)}"
+            f"sensor {name}: {result.baseline_text()}, from {result.baseline.origin}"
             for name, course in sorted(self._sensors.items())
             if (result := course.zeroed) is not None and result.baseline is not None
         ]
@@ -177,11 +144,6 @@ class Statistics:
             lines.append(f"records left out for slow readers: {self.unwritten}")
         if self.sink_trouble:
             lines.append(f"sinks: {self.sink_trouble}")
-        if self.events:
-            counts = ", ".join(f"{kind} {count}" for kind, count in self.events.items())
-            lines.append(f"events: {counts}")
-        if self.commands_refused:
-            lines.append(f"refused: {self.commands_refused} lines or messages were not commands")
         return "\n".join(lines)
 
     def _without_pattern(self) -> list[str]:
@@ -204,55 +166,23 @@ class Statistics:
         return lines
 
 
-def _drift_text(drift: Drift | None) -> str:
-    if drift is None or round(max(map(abs, drift.common_counts))) == 0:
-        return ""
-    x, y, z = drift.common_counts
-    return f"; drifted since by x {x:.0f}, y {y:.0f}, z {z:.0f} counts"
-
-
-_MESSAGES: Final = {
-    "without_readings": "they name no sensor: is one plugged in, and in the server's xServ.ini?",
-    "foreign_sensor": "their sensors are of another pad: --id-map",
-    "bad_sensor": "the counts of their sensors are not those of a pad",
-    "bad_json": "they are no JSON with a number: another server answers at this address",
-    "welcomes": "the server only greets: is a sensor plugged in, and in its xServ.ini?",
-}
-"""Reasons why messages of a server gave no reading, by their counters."""
-
-
 def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int]]) -> str:
     """Return what came of the sources, as the user named them, what may be wrong, and what to do."""
     source = f" --source {as_typed(sources[0])}" if len(sources) == 1 else ""
     doctor = f"edge-sr doctor{source} shows what is wrong"
     arrived = Counter(counters())
-    received, bad, binary = arrived["received_bytes"], arrived["bad_lines"], arrived["non_ascii_lines"]
+    received = arrived["received_bytes"]
     if arrived["messages"]:
-        why = max(_MESSAGES, key=arrived.__getitem__)
-        lack = f"no reading in them: {_MESSAGES[why]}" if arrived[why] else "no whole scan in them"
-        return f"{arrived['messages']} messages came from the server, and {lack}; {doctor}"
+        return f"{arrived['messages']} messages came from the server, and no whole scan in them; {doctor}"
     if arrived["frames"]:
-        lack = "none of a taxel: another kind of pad (--id-map), or another bus"
-        if arrived["readings"]:
-            lack = "no whole scan: frames are lost, or this is another kind of pad (--id-map)"
+        lack = "no whole scan in them: frames are lost, or this is another kind of pad (--id-map)"
         return f"{arrived['frames']} CAN frames came, and {lack}; {doctor}"
-    # An adapter that was reset may send one line without a CAN frame; bytes of no line are those of four long ones.
-    if bad + binary >= 4 or arrived["skipped_bytes"] >= 120:
-        what = "text of another device (a modem, a GPS receiver)"
-        if not bad + binary:
-            what = "no line that ends as an adapter's: another device, such as one whose lines end with LF alone"
-        elif binary > bad:
-            what = "no text: another line speed than the adapter's, or another device"
-        return (
-            f"{received} bytes came, and no CAN frame in them: {what}; edge-sr devices lists what is plugged in, and "
-            "@BAUD after the port sets a speed"
-        )
     if errors := arrived["error_frames"] + arrived["fd_frames"]:
+        return f"{errors} error frames or frames of CAN FD came, and no reading: is the bus at 1 Mbit/s? {doctor}"
+    if received >= ANSWERS_BYTES:
         return (
-            f"{errors} error frames or frames of CAN FD came, and no reading: the bus runs at another bitrate than "
-            f"1 Mbit/s, or lacks its termination; {doctor}"
+            f"{received} bytes came, and no CAN frame in them: another device, or another line speed (@BAUD after the "
+            f"port)? edge-sr devices lists what is plugged in, and {doctor}"
         )
-    if arrived["refusals"]:
-        return f"the adapter refused {arrived['refusals']} commands, and sent no CAN frame; {doctor}"
     came = f"{received} bytes came, the adapter's answers alone" if received else "nothing came"
     return f"{came}: is the sensor powered and its cable in? {doctor}"

@@ -194,7 +194,12 @@ class Source:
         if not self._opened or self._closed:
             raise self._not_open()
         if self.patient:
-            return self._take_next(timeout_s)
+            (reader,) = self._readers
+            if reader.link.ended:
+                return None
+            scans = reader.read(timeout_s)
+            self.last_ns = scans[-1].time_ns if scans else self.last_ns
+            return [*reader.notices(), *reader.link.poses(), *scans]
         if not self._through:
             try:
                 self._bell.get(timeout=timeout_s)
@@ -219,14 +224,6 @@ class Source:
 
     def _not_open(self) -> UsageError:
         return UsageError(f"source {self.name} is not open: use it in a with statement, or call open()")
-
-    def _take_next(self, timeout_s: float) -> list[Scan | Notice | TimedPose] | None:
-        (reader,) = self._readers
-        if reader.link.ended:
-            return None
-        scans = reader.read(timeout_s)
-        self.last_ns = scans[-1].time_ns if scans else self.last_ns
-        return [*reader.notices(), *reader.link.poses(), *scans]
 
     def _started(self, reader: LinkReader) -> threading.Thread:
         """Return a new thread that reads a link; its error ends all reading, and is raised by `take`.

@@ -80,17 +80,25 @@ class CountersInTurn:
     """Turns of a sensor's records to have the counters: one a second, and each in which one but PROGRESS changes."""
 
     def __init__(self) -> None:
-        self._shown: dict[str, tuple[int, dict[str, int]]] = {}
+        self._shown: dict[str, tuple[int, Mapping[str, int], int]] = {}  # when, the newest counters, and left out
 
-    def of(self, result: Result, counters: Mapping[str, int]) -> Mapping[str, int] | None:
-        """Return the counters where it is this record's turn to have them, else None."""
+    def of(self, result: Result, counters: Mapping[str, int], unwritten: int = 0) -> Mapping[str, int] | None:
+        """Return the counters where it is this record's turn to have them, else None.
+
+        `unwritten` are the records that were left out for this sink's reader alone.
+        """
         scan = result.scan
-        troubles = {name: count for name, count in counters.items() if name not in PROGRESS}
-        before_ns, before = self._shown.get(scan.sensor, (None, None))
-        if before_ns is not None and 0 <= scan.time_ns - before_ns < COUNTED_NS and before == troubles:
+        shown_ns, shown, left_out = self._shown.get(scan.sensor, (-COUNTED_NS, counters, 0))
+        turn = not 0 <= scan.time_ns - shown_ns < COUNTED_NS or unwritten != left_out
+        if not turn and counters is shown:
             return None
-        self._shown[scan.sensor] = scan.time_ns, troubles
-        return counters
+        turn = turn or _losses(counters) != _losses(shown)
+        self._shown[scan.sensor] = scan.time_ns if turn else shown_ns, counters, unwritten
+        return counters if turn else None
+
+
+def _losses(counters: Mapping[str, int]) -> dict[str, int]:
+    return {name: count for name, count in counters.items() if name not in PROGRESS}
 
 
 def chosen_fields(text: str) -> frozenset[str]:
@@ -178,8 +186,8 @@ class JsonLinesSink(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Write one record; its counter `unwritten` counts what was left out for this reader only."""
-        counters = {**counters, "unwritten": self.unwritten}
-        fields = self._form.of(result, self._turns.of(result, counters))
+        counted = self._turns.of(result, counters, self.unwritten)
+        fields = self._form.of(result, None if counted is None else {**counted, "unwritten": self.unwritten})
         if self._contract is not None:
             fields[CONTACTS] = _contacts(result, self._contract)
         self._write(fields)

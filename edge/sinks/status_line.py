@@ -3,13 +3,11 @@
 import shutil
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Callable, Mapping
 from typing import Final, TextIO
 
 from edge.perception.event import Event
-from edge.perception.result import NextTap, Result
-from edge.pipeline.cadence import Cadence
+from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 from edge.terminal.progress_bar import drawn, rewritable
 from firmware_bridge.errors import harmless
@@ -18,7 +16,6 @@ from firmware_bridge.schedule import SHOWN_AT_REST_S, SHOWN_SILENT_S
 CLEAR_TO_END: Final = "\x1b[K"
 _COUNTED: Final = ("dropped", "overruns", "torn_wire", "unwritten", "poses", "poses_refused", "poses_dropped")
 """Counters on the line. Of scans torn at the source, noise makes one in forty of a healthy sensor: not an alarm."""
-_SHORTER: Final = {"overruns": "overrun", "torn_wire": "torn"}
 
 
 class StatusSink(Sink):
@@ -31,7 +28,6 @@ class StatusSink(Sink):
         self._clock_s = clock_s
         self._terminal = rewritable(self._stream)
         self._latest: dict[str, Result] = {}
-        self._cadences: defaultdict[str, Cadence] = defaultdict(Cadence)
         self._counters: Mapping[str, int] = {}
         self._last_scan_s = clock_s()
         self._received_s: dict[str, float] = {}
@@ -41,7 +37,6 @@ class StatusSink(Sink):
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Show one result, unless the line is fresh."""
         self._latest[result.scan.sensor] = result
-        self._cadences[result.scan.sensor].follow(result.scan)
         self._counters = counters
         self._last_scan_s = self._received_s[result.scan.sensor] = self._clock_s()
         self._refresh()
@@ -77,36 +72,28 @@ class StatusSink(Sink):
             self._terminal = False  # the window was closed; that ends no recording
 
     def _fitted(self, columns: int) -> str:
-        """Return the line, of which a narrow terminal gets the brief one; a part that is too long is left out whole."""
+        """Return the line; on a narrow terminal a part that is too long is left out whole."""
         line = self.line()
-        if len(line) > columns:
-            line = self.line(brief=True)
         if len(line) <= columns:
             return line
         room = max(columns - len(" ..."), 0)
         ends = [line.rfind(between, 0, room + len(between)) for between in (" | ", " ")]
         return (line[: next((end for end in ends if end > 0), 0)] + " ...")[: max(columns, 0)]
 
-    def line(self, *, brief: bool = False) -> str:
-        """Return the line, the most important part first; a brief one has only what a person acts on."""
-        parts = []
-        sources = {result.source for result in self._latest.values()} - {"device"}
-        parts += sorted(source.upper() for source in sources)
+    def line(self) -> str:
+        """Return the line of what a person acts on, the most important part first."""
+        parts = sorted({result.source.upper() for result in self._latest.values()} - {"DEVICE"})
         silence_s = self._clock_s() - self._last_scan_s
         if silence_s >= SHOWN_SILENT_S or not self._latest:
             parts.append(f"no scan for {silence_s:.0f} s")
-        parts += [self._sensor_text(name, brief=brief) for name in sorted(self._latest)]
+        parts += [self._sensor_text(name) for name in sorted(self._latest)]
         if self._without_poses:
             of = ",".join(sorted(name or "" for name in self._without_poses))
             parts.append(f"NO POSES {of}".rstrip())
         counted = ((name, self._counters.get(name, 0)) for name in _COUNTED)
-        parts += [f"{count} {_SHORTER.get(name, name.replace('_', ' '))}" for name, count in counted if count]
-        if not brief:
-            zeroed = [result for _, result in sorted(self._latest.items()) if result.baseline is not None]
-            parts += [result.baseline_text() for result in zeroed]
-        return " | ".join(parts)
+        return " | ".join([*parts, *(f"{count} {name.replace('_', ' ')}" for name, count in counted if count)])
 
-    def _sensor_text(self, name: str, *, brief: bool) -> str:
+    def _sensor_text(self, name: str) -> str:
         result = self._latest[name]
         silence_s = self._clock_s() - self._received_s[name]
         if silence_s >= SHOWN_SILENT_S and len(self._latest) > 1:
@@ -130,29 +117,7 @@ class StatusSink(Sink):
             words.append(f"{result.force_counts:.0f} counts")
         if result.area_mm2 is not None:
             words.append(f"{result.area_mm2:.0f} mm2")
-        if brief:
-            return " ".join(words)
-        if result.contact:
-            words.append(f"tap {result.taps_used}")
-        if result.interval_mm is not None:
-            words.append(f"+-{result.interval_mm:.3f} mm")
-        if result.next_tap is not None:
-            words.append(_next_tap_text(result.next_tap))
-        if result.reused_from is not None:
-            words.append("unchanged")
-        elif result.run_time_us is not None:
-            words.append(f"{result.run_time_us:.0f} us")
-        rate_hz = self._cadences[name].rate_hz
-        if rate_hz is not None:
-            words.append(f"{rate_hz:.0f} Hz")
         return " ".join(words)
-
-
-def _next_tap_text(proposed: NextTap) -> str:
-    """Return where to touch next in a user's words, as the pad's axes are drawn."""
-    ways = ((proposed.dx_mm, "left", "right"), (proposed.dy_mm, "up", "down"))
-    moves = [f"{abs(mm):.1f} mm {less if mm < 0 else more}" for mm, less, more in ways if mm]
-    return f"next tap {' '.join(moves)}"
 
 
 class MessageSink(Sink):

@@ -47,9 +47,13 @@ class ZenohSink(Sink):
     def __init__(self, target: str, source: Source) -> None:
         """Open a session; it does not matter whether a subscriber is there, now or later."""
         self._target, self._source = target, source.kind
-        self._key, self._session = open_session(target)
-        import zenoh
-
+        self._key, configuration = parsed_target(target)
+        try:
+            import zenoh
+        except ImportError as error:
+            raise SinkError(f"zenoh: needs eclipse-zenoh: {how_to_install('zenoh')}") from error
+        with opening():
+            self._session = zenoh.open(_configured(configuration))
         self._failure = zenoh.ZError
         self._turns = CountersInTurn()
         congestion = zenoh.CongestionControl
@@ -80,8 +84,18 @@ class ZenohSink(Sink):
         self.put(self._events, orjson.dumps(event_record(event, counters, self._source)))
 
     def close(self) -> None:
-        """Send what is under way, and end; subscribers to KEY/alive/* are notified by zenoh."""
-        close_session(self._session)
+        """Send what is under way, and end; subscribers to KEY/alive/* are notified by zenoh.
+
+        It takes half a second at most: a peer that stands still would delay zenoh for ten.
+        """
+
+        def close() -> None:
+            with suppress(self._failure):  # it took too long, after everything was put without an error
+                self._session.close()
+
+        closing = threading.Thread(target=close, name="zenoh-close", daemon=True)
+        closing.start()
+        closing.join(0.5)
 
     def _declare(self, sensor: str) -> "tuple[zenoh.Publisher, zenoh.Publisher]":
         base = f"{self._key}/{chunks(sensor)}"
@@ -125,17 +139,6 @@ def parsed_target(target: str) -> tuple[str, dict[str, Any] | Path]:
     )
 
 
-def open_session(target: str) -> "tuple[str, zenoh.Session]":
-    """Return the key of a target, and an open session; a SinkError where zenoh is missing, or cannot be opened."""
-    key, configuration = parsed_target(target)
-    try:
-        import zenoh
-    except ImportError as error:
-        raise SinkError(f"zenoh: needs eclipse-zenoh: {how_to_install('zenoh')}") from error
-    with opening():
-        return key, zenoh.open(_configured(configuration))
-
-
 @contextmanager
 def opening() -> Iterator[None]:
     """Turn zenoh's error while something is opened into a SinkError."""
@@ -145,19 +148,6 @@ def opening() -> Iterator[None]:
         yield
     except zenoh.ZError as error:
         raise SinkError(f"zenoh cannot be opened: {_reason(error)}") from error
-
-
-def close_session(session: "zenoh.Session") -> None:
-    """End a session within half a second: a peer that stands still would delay zenoh for ten seconds."""
-    import zenoh
-
-    def close() -> None:
-        with suppress(zenoh.ZError):  # it took too long, after everything was put without an error
-            session.close()
-
-    closing = threading.Thread(target=close, name="zenoh-close", daemon=True)
-    closing.start()
-    closing.join(0.5)
 
 
 def _configured(configuration: dict[str, Any] | Path) -> "zenoh.Config":

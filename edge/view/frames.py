@@ -221,8 +221,7 @@ class Frames:
                 if point.number <= newest.number
             ],
         }
-        taps = None if result.window is None else result.window[: result.taps_used, 2]
-        maps = {"zeroed": result.zeroed, "pattern": result.pattern, "deviation": result.deviation, "taps": taps}
+        maps = {"zeroed": result.zeroed, "pattern": result.pattern, "deviation": result.deviation}
         maps["truth"] = None if result.pattern is None else self._snapshot.truth_of(result)
         return pack(header, {name: values for name, values in maps.items() if values is not None})
 
@@ -240,7 +239,6 @@ def hello(source: Source, model: str, contract: Contract) -> bytes:
         "taps": contract.taps,
         "pattern_unit": contract.output_unit,
         "full_scale": contract.output_full_scale,
-        "contact_level": contract.contact_level,
         "pixel_pitch_mm": contract.pitch_mm / contract.scale,
         "taxel_pitch_mm": contract.pitch_mm,
         "rows": contract.rows,
@@ -282,12 +280,10 @@ class Viewer:
     """Viewer of the page; every frame holds the newest values, however long ago the frame before was sent.
 
     Attributes:
-        paused: no results meanwhile; events go on.
         pinged_s: time since which a ping is unanswered, in [s]; None while none is.
     """
 
     def __init__(self) -> None:
-        self.paused = False
         self.pinged_s: float | None = None
         self._seen: dict[str, int] = {}
         self._sent_number = 0
@@ -298,16 +294,11 @@ class Viewer:
         return self.pinged_s is None or now_s - self.pinged_s < LATE_S
 
     def due(self, frames: Frames) -> list[bytes]:
-        """Return the frames that are new since the last call.
-
-        These are events, and unless the viewer has paused one frame a sensor and one of the map.
-        """
+        """Return the frames that are new since the last call: events, one frame a sensor and one of the map."""
         due: list[bytes] = []
         for number, frame in frames.events(self._sent_number):
             self._sent_number = number
             due.append(frame)
-        if self.paused:
-            return due
         for sensor, newest in frames.newest.items():
             seen = self._seen.get(sensor, 0)
             if newest.number > seen:
@@ -319,28 +310,16 @@ class Viewer:
         return due
 
 
-def execute(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
-    """Queue the command in a viewer's message, JSON as on stdin, or pause the viewer.
-
-    Returns the reason if it is refused.
-    """
-    why = _refusal(message, viewer, commands)
-    if why is not None:
-        commands.refuse()
-    return why
-
-
-def _refusal(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
+def execute(message: str | bytes, commands: Commands) -> str | None:
+    """Queue the command in a viewer's message, JSON as on stdin; return the reason if it is refused."""
     parsed = json_object(message) if isinstance(message, str) else None
-    if parsed is not None and parsed.get("cmd") == "pause" and isinstance(parsed.get("on"), bool):
-        viewer.paused = parsed["on"]
-        return None
     command = None if parsed is None else runtime_command(parsed)
-    if command is None:
-        shown = repr(message[:60])
-        shown = shown if len(message) <= 60 else f"{shown[:-1]}...{shown[-1]}"
-        return f'{shown} is not a command: expected {FORMS}, or {{"cmd": "pause", "on": true}}'
-    if commands.full:
+    if command is not None and not commands.full:
+        commands.put(command)
+        return None
+    commands.refuse()
+    if command is not None:
         return f"{WAITING} commands are waiting: repeat it when the run has executed them"
-    commands.put(command)
-    return None
+    shown = repr(message[:60])
+    shown = shown if len(message) <= 60 else f"{shown[:-1]}...{shown[-1]}"
+    return f"{shown} is not a command: expected {FORMS}"

@@ -256,7 +256,7 @@ class LiveView:
             async for message in connection:
                 if connection.state is not State.OPEN:
                     break  # many commands may wait from before it closed, and each takes its time
-                why = execute(message, viewer, self._commands)
+                why = execute(message, self._commands)
                 if why is not None:
                     broadcast([connection], refused(time.monotonic_ns(), why, self._source))
                 await asyncio.sleep(0.02)  # so that who never stops asking does not delay the loop

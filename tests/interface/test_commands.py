@@ -5,6 +5,7 @@ import json
 import os
 import pty
 import select
+import shlex
 import signal
 import sys
 import termios
@@ -140,38 +141,6 @@ def test_all_places_are_asked_and_obeyed_in_their_order(stdin, pipe):
 
 
 TIMEOUT_S = 60.0
-# A shell of the least words; as those that people use, it restores the terminal after a job that was stopped or killed.
-SHELL = """
-import os, signal, sys, termios
-found = termios.tcgetattr(0)
-signal.signal(signal.SIGTTOU, signal.SIG_IGN)
-job = os.fork()
-if job == 0:
-    os.setpgid(0, 0)
-    os.tcsetpgrp(0, os.getpgrp())
-    for number in (signal.SIGTTOU, signal.SIGQUIT, signal.SIGINT):  # who started the tests may have left them out
-        signal.signal(number, signal.SIG_DFL)
-    os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
-while True:
-    status = os.waitpid(job, os.WUNTRACED)[1]
-    os.tcsetpgrp(0, os.getpgrp())
-    if os.WIFSTOPPED(status) or os.WIFSIGNALED(status):
-        termios.tcsetattr(0, termios.TCSANOW, found)
-    if not os.WIFSTOPPED(status):
-        print(f"<ended {os.waitstatus_to_exitcode(status)}>", flush=True)
-        os.read(0, 1)
-        break
-    print("<stopped>", flush=True)
-    while True:
-        word = b""
-        while not word.endswith(b"."):
-            word += os.read(0, 1)
-        if word.strip() == b"fg.":
-            os.tcsetpgrp(0, job)
-        os.kill(-job, signal.SIGCONT)
-        if word.strip() == b"fg.":
-            break
-"""
 
 
 @pytest.fixture(scope="module")
@@ -189,16 +158,17 @@ def long(tmp_path_factory):
 
 
 class Terminal:
-    """A shell on a pseudo-terminal."""
+    """A shell on a pseudo-terminal, without its line editor, which would set the terminal itself."""
 
     def __init__(self, folder: Path, options: list) -> None:
         self.records = folder / "out.jsonl"
-        command = ["-m", "edge.cli.main", *options, "--sink", f"jsonl:{self.records}"]
+        command = [sys.executable, "-m", "edge.cli.main", *map(str, options), "--sink", f"jsonl:{self.records}"]
         self.shown = b""
         self._process, self.leader = pty.fork()
         if self._process == 0:
             os.chdir(ROOT)
-            os.execv(sys.executable, [sys.executable, "-c", SHELL, *map(str, command)])
+            os.execvp("bash", ["bash", "--norc", "--noprofile", "--noediting", "-i"])
+        self.type(shlex.join(command) + "\n")
         self.until(lambda: not self.line_mode() and self.records.exists() and self.records.stat().st_size > 0)
 
     def wait_for(self, *texts):
@@ -255,22 +225,23 @@ def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     terminal.until(lambda: any("zeroed on demand" in event for event in terminal.events()))
 
     terminal.type("\x1a")  # Ctrl-Z
-    terminal.wait_for("<stopped>")
+    terminal.wait_for("Stopped")
     assert terminal.line_mode()
-    terminal.type("fg.\n")
+    terminal.type("fg\n")
     terminal.until(lambda: not terminal.line_mode())
     before = len(terminal.events())
     terminal.type("Z")
     terminal.until(lambda: len(terminal.events()) > before)
 
     terminal.type("\x1a")
-    terminal.wait_for("<stopped>")
+    terminal.wait_for("Stopped")
     size = terminal.records.stat().st_size
-    terminal.type("bg.\n")
+    terminal.type("bg\n")
     terminal.until(lambda: terminal.records.stat().st_size > size + 50_000)
     assert terminal.line_mode(), "in the background it goes on, and leaves the terminal alone"
-    terminal.type("fg.\n")
+    terminal.type("fg\n")
     terminal.until(lambda: not terminal.line_mode())
     terminal.type("\x03")  # Ctrl-C
-    assert "scans, " in terminal.wait_for("<ended 0>")
-    assert terminal.line_mode()
+    terminal.until(terminal.line_mode)
+    terminal.type("echo ended by $?.\n")
+    assert "scans, " in terminal.wait_for("ended by 0.")

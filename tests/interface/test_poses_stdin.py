@@ -67,12 +67,6 @@ class TestFields:
 
 
 class TestQueue:
-    def test_a_message_that_names_no_sensor_is_for_that_of_its_key(self):
-        queue = PoseQueue()
-        for sensor in ("null", '"6"'):
-            queue.put_json(f'{{"x_mm": 1, "y_mm": 0, "sensor": {sensor}}}'.encode(), 0, "4")
-        assert [one.sensor for one in queue.take()] == ["4", "6"]
-
     def test_it_is_bounded_and_the_oldest_are_dropped(self):
         queue = PoseQueue()
         for number in range(WAITING_POSES + 10):

@@ -200,33 +200,29 @@ def answered(scans):
     return link, ListSink(on_write=lambda result: written[result.scan.number].set())
 
 
-class TestOvertaking:
-    def test_scans_between_the_calls_of_a_round_overtake(self):
-        """Six sensors press; a call takes four of them, and the next scans come during each of the first two calls."""
-        names = [f"{number}" for number in range(6)]
-        batches = [[make_scan(n, sensor=name, press_counts=3000 + 500 * n) for name in names] for n in range(3)]
-        gates, read_on = [threading.Event(), threading.Event()], [threading.Event(), threading.Event()]
-        link = FakeLink(
-            [batches[0], gates[0], batches[1], read_on[0].set, gates[1], batches[2], read_on[1].set],
-        )
-        calls = []
+def test_scans_that_come_during_a_turn_wait_for_the_next():
+    """Six sensors press; a call takes four of them, and the next scans come during each of the first two calls."""
+    names = [f"{number}" for number in range(6)]
+    batches = [[make_scan(n, sensor=name, press_counts=3000 + 500 * n) for name in names] for n in range(3)]
+    gates, read_on = [threading.Event(), threading.Event()], [threading.Event(), threading.Event()]
+    link = FakeLink([batches[0], gates[0], batches[1], read_on[0].set, gates[1], batches[2], read_on[1].set])
+    calls = []
 
-        class Slow(FakeModel):
-            def run_together(self, windows, pads=None, poses=None):
-                calls.append(len(windows))
-                if len(calls) <= 2:
-                    gates[len(calls) - 1].set()
-                    assert read_on[len(calls) - 1].wait(10)
-                return super().run_together(windows, pads)
+    class Slow(FakeModel):
+        def run_together(self, windows, pads=None, poses=None):
+            calls.append(len(windows))
+            if len(calls) <= 2:
+                gates[len(calls) - 1].set()
+                assert read_on[len(calls) - 1].wait(10)
+            return super().run_together(windows, pads)
 
-        baselines, sink = dict.fromkeys(names, BASELINE), ListSink()
-        runtime = make_runtime(Slow(), baselines=baselines)
-        statistics = pumped(link, sink, runtime=runtime, rate_hz=250)
-        made = [(one.scan.number, one.scan.sensor) for one in sink.results if one.pattern is not None]
-        assert calls == [4, 4, 4, 2]
-        assert made == [(number, name) for number, names in enumerate(("0123", "4501", "230145")) for name in names]
-        assert statistics.dropped == 4
-        assert all(numbers(sink, name) == [0, 1, 2] for name in names)
+    sink = ListSink()
+    runtime = make_runtime(Slow(), baselines=dict.fromkeys(names, BASELINE))
+    statistics = pumped(link, sink, runtime=runtime, rate_hz=250)
+    made = [(one.scan.number, one.scan.sensor) for one in sink.results if one.pattern is not None]
+    assert calls == [4, 2, 4, 2] and statistics.dropped == 6
+    assert made == [(number, name) for number in (0, 2) for name in names]
+    assert all(numbers(sink, name) == [0, 1, 2] for name in names)
 
 
 class TestEnds:
@@ -265,8 +261,7 @@ class TestRecords:
             counted = [counters["scans"] for counters in sink.counters]
             assert counted == [1, 3, 3] if patient else all(counted[n] >= at for n, at in enumerate((1, 3, 3)))
 
-    @pytest.mark.parametrize("error", [None, LinkLostError("gone")])
-    def test_they_tell_how_many_were_left_out(self, error):
+    def test_the_statistics_tell_how_many_were_left_out(self):
         class Slow(ListSink):
             unwritten = 0
             trouble = "the disk is full"
@@ -277,9 +272,8 @@ class TestRecords:
 
         sink, statistics = Slow(), Statistics()
         with suppress(LinkLostError):
-            link = FakeLink([presses([0]), presses([1, 2])], error=error)
+            link = FakeLink([presses([0]), presses([1, 2])], error=LinkLostError("gone"))
             pumped(link, sink, ListSink(), statistics=statistics)
-        assert [counters["unwritten"] for counters in sink.counters] == [0, 1, 2]
         assert statistics.unwritten == 3 and statistics.sink_trouble == "the disk is full"
 
     @pytest.mark.parametrize("kind", ["lost", "silent", "back", "trouble", "well"])
@@ -316,4 +310,4 @@ class TestDeadline:
         assert [counters["late"] for counters in sink.counters] == [0] * 7 + [1, 2, 3]
         assert ["late" in [note.kind for note in result.notes] for result in sink.results] == [False] * 9 + [True]
         assert "this pattern was ready 0.29 s after its newest reading arrived" in (sink.results[9].note or "")
-        assert statistics.late == 3 and statistics.latency_us.count == 10 and statistics.dropped == 0
+        assert statistics.late == 3 and len(statistics.latency_us) == 10 and statistics.dropped == 0

@@ -6,13 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from edge_samples import BASELINE, ROOT, make_scan
-from hypothesis import given
-from hypothesis import strategies as st
 from runtime_samples import Pushed
 
 from edge.perception.event import KINDS, NOTE_KINDS, Event, Note, joined
 from edge.perception.result import Result
-from edge.pipeline.run_statistics import Histogram, Statistics
+from edge.pipeline.run_statistics import Statistics
 
 
 def result(scan, state="idle", run_time_us=None, **more):
@@ -43,48 +41,23 @@ def test_which_baseline_and_how_old(age_s, age):
     assert result(make_scan()).baseline_text() == "no baseline"
 
 
-class TestHistogram:
-    @given(st.lists(st.floats(1, 1e7), min_size=1, max_size=200), st.floats(0.01, 1))
-    def test_quantiles_are_at_most_one_bucket_too_high(self, values, share):
-        histogram = Histogram()
-        for value in values:
-            histogram.add(value)
-        exact = float(np.quantile(values, share, method="inverted_cdf"))
-        got = histogram.quantile(share)
-        assert got is not None and exact * (1 - 1e-9) <= got <= exact * 1.0219
-        assert got <= histogram.max == max(values)
-
-    def test_extreme_values_stay_within(self):
-        histogram = Histogram()
-        for value in (0.0, 1e-9, 1e30):
-            histogram.add(value)
-        assert histogram.count == 3 and histogram.max == 1e30 and histogram.quantile(0.5) == 1.0
-
-
 class TestSummary:
     def test_it_tells_all_of_it(self):
-        every, half_s = tuple(range(16)), 500_000_000
-        torn = [at(n, n * half_s, "4", "contact", 200.0, absent=(0,), stale=every[9 * n :]) for n in range(3)]
+        half_s = 500_000_000
+        contacts = [at(n, n * half_s, "4", "contact", 200.0) for n in range(3)]
         known = replace(at(3, 3 * half_s), baseline=BASELINE, baseline_age_s=90.0)
         again = replace(at(5, 5 * half_s, state="contact"), reused_from=2)
-        in_part, repeated = at(6, 6 * half_s, stale=(1,)), at(7, 7 * half_s, stale=every)
-        statistics = counted([*torn, known, at(4, 4 * half_s, state="dropped"), again, in_part, repeated])
+        statistics = counted([*contacts, known, at(4, 4 * half_s, state="dropped"), again])
         statistics.overruns = 7
-        statistics.commands_refused = 2
         statistics.sink_trouble = "nobody subscribes to zenoh:a"
-        for kind in ("lost", "back", "lost"):
-            statistics.tell(Event(0, kind, None, ""))
         assert statistics.summary(source="EMULATED demo", wanted_rate_hz=100).splitlines() == [
-            "EMULATED demo: 8 scans, 4 patterns (1 reused), 1 dropped, 7 overrun, 0 missed",
-            "torn: 3 on the wire, 1 renewed in part; 1 repeated",
+            "EMULATED demo: 6 scans, 4 patterns (1 reused), 1 dropped, 7 overrun, 0 missed",
             "run time: p50 200 us, p99 200 us, max 200 us",
             "rate held: 2.0 Hz (sensor 4), 100 Hz asked for",
             f"sensor 4: baseline {BASELINE.id} 90 s old, from file",
             "sinks: nobody subscribes to zenoh:a",
-            "events: lost 2, back 1",
-            "refused: 2 lines or messages were not commands",
         ]
-        assert len(Statistics().summary(source="x").splitlines()) == 2
+        assert len(Statistics().summary(source="x").splitlines()) == 1
 
     @pytest.mark.parametrize(
         ("results", "why"),

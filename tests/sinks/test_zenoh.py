@@ -68,21 +68,7 @@ class TestMessages:
         assert f"edge-sr: {why}\n" in told and f"\nsinks: {why}\n" in told
 
     def test_every_sensor_name_makes_a_key_of_its_own_and_is_told(self):
-        names = [
-            "4",
-            "left/4",
-            "/4",
-            "a//b",
-            "a/b",
-            "a%2F%2Fb",
-            "a%2Fb",
-            "a*?#$b",
-            "%2F",
-            "@left",
-            "a b",
-            "a%20b",
-            "右",
-        ]
+        names = ["4", "left/4", "/4", "a//b", "a/b", "a%2F%2Fb", "a*?#$b", "@left", "a b", "a%20b", "右"]
         parts = [chunks(name) for name in names]
         assert list(map(unquote, parts)) == names and len(set(parts)) == len(names)
         for part in parts:
@@ -90,19 +76,6 @@ class TestMessages:
 
 
 class TestWhoComesAndGoes:
-    def test_that_nobody_subscribes_is_told_until_somebody_does(self, endpoint):
-        with listening(endpoint) as place:
-            sink, (result,) = ZenohSink(f"grip?connect={endpoint}", fake_source()), make_results(1)
-            assert sink.trouble is None
-            sink.write(result, {})
-            assert str(sink.trouble).startswith(f"nobody subscribes to zenoh:grip?connect={endpoint}: check its ")
-            for key in ("grip/*/scan", "grip/4/pattern", "grip/event"):
-                reader = place.declare_subscriber(key)
-                wait_for(lambda: sink.write(result, {}) or sink.trouble is None)
-                reader.undeclare()
-                wait_for(lambda: sink.write(result, {}) or sink.trouble is not None)
-            sink.close()
-
     def test_a_reader_that_stands_still_holds_up_nobody(self, endpoint, consume):
         consumer, result = consume(endpoint), make_results(2)[1]
         sink = ZenohSink(f"grip?connect={endpoint}", fake_source("device"))
@@ -120,17 +93,7 @@ class TestWhoComesAndGoes:
         scans = [json.loads(bytes.fromhex(words[-1]))["scan"] for words in told if words[1].endswith("/scan")]
         assert len(scans) < 1000 and sorted(scans[scans.index(0) :]) == scans[scans.index(0) :]
 
-    def test_a_killed_writer_is_told_to_have_gone(self, endpoint, consume):
-        consumer = consume(endpoint)
-        imports = "from edge.sinks.zenoh import ZenohSink; from edge_samples import fake_source"
-        script = f"{imports}; sink = ZenohSink('grip?connect={endpoint}', fake_source()); input()"
-        with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE) as writer:
-            assert consumer.next()[0] == "came"
-            writer.kill()
-            assert consumer.next()[0] == "went"
-
-    @pytest.mark.parametrize("reader_goes", [True, False])
-    def test_the_example_ends_quietly_with_its_reader_or_with_ctrl_c(self, endpoint, reader_goes):
+    def test_the_example_prints_patterns_events_and_who_goes(self, endpoint):
         command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", endpoint]
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         with ended(subprocess.Popen(command, **streams)) as listener:
@@ -140,17 +103,13 @@ class TestWhoComesAndGoes:
             sink.write(pressed, {})
             sink.tell(Event(5, "lost", None, "the cable is out"), {})
             lines = {listener.stdout.readline() for _ in range(3)}
-            if reader_goes:
-                listener.stdout.close()  # that the sink goes is what would be reported
-                sink.close()
-            else:
-                sink.close()
-                lines.add(listener.stdout.readline())
-                listener.send_signal(signal.SIGINT)
+            sink.close()
+            lines.add(listener.stdout.readline())
+            listener.send_signal(signal.SIGINT)
             assert (listener.stderr.read(), listener.wait(60)) == ("", 0)
         alive = f"grip/left/alive/{sink.zid}"
         pattern = "4 emulated scan 1: 3000.0 counts, 3.000 mm at most\n"
-        assert lines | {f"{alive} went\n"} == {f"{alive} came\n", pattern, "the cable is out\n", f"{alive} went\n"}
+        assert lines == {f"{alive} came\n", pattern, "the cable is out\n", f"{alive} went\n"}
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from edge.errors import UsageError
 from edge.pipeline.commands import WAITING, Commands
 from edge.view.access import grant, is_loopback
-from edge.view.frames import Viewer, execute
+from edge.view.frames import execute
 
 TOKEN = "correct-horse-battery"
 OURS = "127.0.0.1:8077"
@@ -107,12 +107,12 @@ def test_the_address_printed_is_one_that_is_granted(host, token, url):
 )
 def test_whatever_is_asked_is_answered(path, hosts, origins, message):
     grant("0.0.0.0", "robot", TOKEN).refusal(path, hosts, origins)
-    execute(message, Viewer(), Commands())
+    execute(message, Commands())
 
 
 def executed(*messages):
     asked = Commands()
-    why = [execute(m if isinstance(m, (str, bytes)) else json.dumps(m), Viewer(), asked) for m in messages]
+    why = [execute(m if isinstance(m, (str, bytes)) else json.dumps(m), asked) for m in messages]
     return asked, why
 
 
@@ -123,8 +123,6 @@ def executed(*messages):
         {"cmd": "zero", "sensro": "4"},
         {"cmd": "zero", "sensor": "\ud800"},  # which no record can hold
         {"cmd": "zero", "sensor": "\x1b]0;mine\a"},  # which a terminal would do
-        {"cmd": "pause"},
-        {"cmd": "pause", "on": "yes"},
     ],
 )
 def test_what_is_no_command_is_counted_and_told(message):
@@ -136,4 +134,4 @@ def test_what_is_no_command_is_counted_and_told(message):
 def test_where_nobody_polls_a_few_wait_and_others_are_refused():
     asked, why = executed(*[{"cmd": "reset"}] * (WAITING + 3))
     assert why.count(None) == WAITING and asked.refused == 3 and len(asked.poll()) == WAITING
-    assert execute('{"cmd": "reset"}', Viewer(), asked) is None
+    assert execute('{"cmd": "reset"}', asked) is None

@@ -65,11 +65,10 @@ def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
     assert header["kind"] == "result" and header["age_s"] == 0.07 and header["note_kinds"] == ["late", "dead"]
     assert {key: header[key] for key in said if key != "counts"} == {k: v for k, v in said.items() if k != "counts"}
     assert header["counts"] == result.scan.counts.tolist() and header["source"] == "emulated"
-    assert list(maps) == ["zeroed", "pattern", "deviation", "taps"]
+    assert list(maps) == ["zeroed", "pattern", "deviation"]
     np.testing.assert_array_equal(maps["pattern"], result.pattern)
     np.testing.assert_array_equal(maps["deviation"], result.deviation)
     np.testing.assert_array_equal(maps["zeroed"], result.zeroed)
-    np.testing.assert_array_equal(maps["taps"], result.window[: result.taps_used, 2])
     drawn = [round(result.force_counts, 1), round(result.area_mm2, 2), round(result.force_n, 4)]
     assert header["trace"] == [[0.0, *drawn, None]]
 

@@ -10,7 +10,7 @@ from io import BytesIO
 import browser_samples
 import numpy as np
 import pytest
-from browser_samples import RGBA, browser, colours_of, live, logged, number, open_page, painted, part, playwright, word
+from browser_samples import RGBA, browser, colours_of, live, logged, number, open_page, part, playwright, word
 from edge_samples import make_pad_contract, wait_for
 from map_samples import letter
 from matplotlib.image import imread
@@ -113,7 +113,7 @@ def test_the_pad_is_outlined_where_to_touch_next(open_page):
 
 def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page):
     contact = Press().next()
-    believed = replace(contact, trusted=True, mismatch=0.021, tap_mismatch=(0.0, 0.25))
+    believed = replace(contact, trusted=True, mismatch=0.021)
     unbelieved = replace(contact, trusted=False, mismatch=0.4, untrusted_reason="unfamiliar")
     text = "baseline in doubt: most taxels are off it; free the pad and zero again"
     doubt = {"state": "baseline_in_doubt", "contact": None, "trusted": False, "untrusted_reason": "baseline"}
@@ -126,8 +126,6 @@ def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page):
         live(page)
         trusted.to_have_text("yes")
         playwright.expect(number(page, "mismatch")).to_have_text("2.1\u202f%")
-        playwright.expect(number(page, "tap_mismatch")).to_have_text("0.00, 0.25")
-        playwright.expect(number(page, "reused_from")).to_have_text("new")
         verdict.to_be_hidden()
         assert red_share(page) < 0.01
 
@@ -140,10 +138,6 @@ def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page):
             browser_samples.resize(page, *size)
             verdict.to_be_in_viewport()
             wait_for(lambda: red_share(page) > 0.25)
-        page.keyboard.press("Space")
-        word(page, "paused")
-        assert red_share(page) > 0.25, "it stays what it was while it is looked at"
-        page.keyboard.press("Space")
 
         shows[0] = replace(contact, trusted=None)
         verdict.to_have_text("too light to check whether the pattern is to be believed")
@@ -180,7 +174,7 @@ def outline(page):
     return (x_mm[pad].min(), x_mm[pad].max(), y_mm[pad].min()) if pad.any() else (np.nan,) * 3
 
 
-def test_a_map_grows_and_who_pauses_or_comes_late_misses_nothing(open_page):
+def test_a_map_grows_and_who_comes_late_misses_nothing(open_page):
     with live_page() as shown:
         mapped = Mapped(shown, letter)
         page = open_page(shown.view.url)
@@ -207,19 +201,8 @@ def test_a_map_grows_and_who_pauses_or_comes_late_misses_nothing(open_page):
         around = pytest.approx((10 - reach, 10 + reach, -5 - reach), abs=0.5)
         wait_for(lambda: outline(page) == around)
 
-        page.keyboard.press("Space")
-        playwright.expect(page.locator("#pause")).to_have_attribute("aria-pressed", "true")
-        before = shown_on(page)
         for y_mm in (16.0, 0.0, -16.0):
             mapped.touch(-20.0, y_mm)
-        for detail in ("first", "second"):  # what is sent with the first comes before the second
-            tell(shown, "tap_dropped", "4", detail)
-            logged(page, detail)
-        painted(page)
-        browser_samples.resize(page, 844, 800)
-        assert outline(page) == around, "a canvas of another size is painted, though paused"
-        assert np.array_equal(shown_on(page), before), "what is looked at stays"
-        page.keyboard.press("Space")
         late = open_page(shown.view.url)
         layers = mapped.sink.whole.layers()
         for one in (page, late):

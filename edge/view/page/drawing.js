@@ -125,16 +125,6 @@ function outlinePad(context, ink, width, height, pxPerMm, next) {
   context.restore();
 }
 
-function thumb(tap) {
-  const item = document.createElement("li");
-  const canvas = item.appendChild(document.createElement("canvas"));
-  [canvas.width, canvas.height] = [4, 4];
-  canvas.setAttribute("role", "img");
-  canvas.setAttribute("aria-label", tap === 0 ? "this tap" : `${tap} taps before`);
-  item.append(tap === 0 ? "now" : `${MINUS}${tap}`);
-  return item;
-}
-
 const LEAST_COUNTS = 200; // so that noise at rest stays dark
 
 // ---- Marks over the pattern and the taxels ----
@@ -148,8 +138,6 @@ function paintOver(sensor, canvas, current) {
   const ink = sensor.pattern === null ? [colour("text"), colour("card")] : ["#fff", "#0009"];
   scaleBar(context, ink, widthMm, width, height);
   const place = ([xMm, yMm]) => [width / 2 + (xMm / widthMm) * width, height / 2 + (yMm / widthMm) * width];
-  const ellipse = current && !sensor.doubted() ? sensor.ellipse() : null;
-  if (ellipse !== null) drawEllipse(context, ink, place, width / widthMm, ellipse);
   const centre = current ? sensor.touched.centroid_mm : null;
   if (centre) {
     const [x, y] = place(centre);
@@ -195,41 +183,3 @@ function paintShear(sensor, context, width, height, rows, cols, values, high) {
     }
   }
 }
-
-// ---- Shape of the contact: its ellipse ----
-
-/** Return the ellipse with the moments of the touched pixels: centre and half axes in mm, and the turn of the long one in degrees; null without any, or if they fill the pad. */
-function contactEllipse({ values, shape: [rows, cols] }, pitchMm, share) {
-  const least = share * largest(values);
-  if (!(least > 0)) return null;
-  let [sum, sumX, sumY, sumXx, sumXy, sumYy] = [0, 0, 0, 0, 0, 0];
-  for (let row = 0, at = 0; row < rows; row++) {
-    for (let col = 0; col < cols; col++, at++) {
-      if (values[at] < least) continue;
-      sum += 1; sumX += col; sumY += row; sumXx += col * col; sumXy += col * row; sumYy += row * row;
-    }
-  }
-  if (sum > 0.9 * rows * cols) return null; // the whole pad has no shape
-  const [x, y] = [sumX / sum, sumY / sum];
-  const [xx, xy, yy] = [sumXx / sum - x * x + 1 / 12, sumXy / sum - x * y, sumYy / sum - y * y + 1 / 12];
-  const [mean, spread] = [(xx + yy) / 2, Math.hypot((xx - yy) / 2, xy)];
-  const halves = [mean + spread, Math.max(mean - spread, 0)].map((moment) => 2 * Math.sqrt(moment) * pitchMm);
-  const turn = (0.5 * Math.atan2(2 * xy, xx - yy) * 180) / Math.PI;
-  return { x: (x - (cols - 1) / 2) * pitchMm, y: (y - (rows - 1) / 2) * pitchMm, halves, turn, pixels: sum };
-}
-
-/** Draw the ellipse, and its long axis where it has one. */
-function drawEllipse(context, ink, place, pxPerMm, ellipse) {
-  const { x, y, halves: [long, wide], turn } = ellipse;
-  const angle = (turn * Math.PI) / 180;
-  const [centreX, centreY] = place([x, y]);
-  haloed(context, ink, 1.2, () => context.ellipse(centreX, centreY, long * pxPerMm, wide * pxPerMm, angle, 0, 2 * Math.PI));
-  if (isRound(ellipse)) return;
-  const [dx, dy] = [Math.cos(angle) * long * pxPerMm, Math.sin(angle) * long * pxPerMm];
-  context.save();
-  context.setLineDash([5, 4]);
-  haloed(context, ink, 1.2, () => { context.moveTo(centreX - dx, centreY - dy); context.lineTo(centreX + dx, centreY + dy); });
-  context.restore();
-}
-
-const isRound = ({ halves: [long, wide] }) => long < 1.15 * wide;

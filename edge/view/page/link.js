@@ -1,10 +1,3 @@
-// ---- Settings kept between visits; a browser may refuse to store them ----
-
-const memory = {
-  get: (key) => { try { return localStorage.getItem(`edge-sr.${key}`); } catch { return null; } },
-  set: (key, value) => { try { localStorage.setItem(`edge-sr.${key}`, value); } catch { /* the setting is lost at the next visit, no more */ } },
-};
-
 /** Return the token that opens the socket; it is stored for this tab's reloads and removed from the address bar. */
 function takeToken() {
   const address = new URL(location.href);

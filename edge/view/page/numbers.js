@@ -62,7 +62,7 @@ function trustText({ state, trusted, untrusted_reason: reason }) {
 
 /**
  * Numbers by group: label, key, what it means, and its text, made of the newest result, of that of the pattern shown
- * (`made`), of the contact's ellipse and of the sensor. Those without a text are losses, which are counted.
+ * (`made`), and of the sensor. Those without a text are losses, which are counted.
  */
 const NUMBERS = {
   Contact: [
@@ -72,10 +72,6 @@ const NUMBERS = {
       ({ sensor }) => sensor.part["area-now"].textContent],
     ["centre", "centroid_mm", "Centre of the touched area, weighted by depth: x to the right, y down, from the pad's centre.",
       ({ made }) => list(made.centroid_mm, 1, "mm")],
-    ["size", "ellipse", "Length and width of the ellipse that has the moments of the touched pixels.",
-      ({ ellipse }) => (ellipse === null ? "\u2013" : `${number(2 * ellipse.halves[0], 1)} \u00d7 ${number(2 * ellipse.halves[1], 1)}${THIN}mm`)],
-    ["long axis", "axis", "Direction of the ellipse's long axis, from x to the right towards y down; round if it is hardly longer than wide.",
-      ({ ellipse }) => (ellipse === null ? "\u2013" : isRound(ellipse) ? "round" : `${number(ellipse.turn)}\u00b0`)],
     ["taps used", "taps_used", "Taps that the pattern was made of, and the most that the model takes.",
       ({ made }) => (made.taps_used ? `${made.taps_used} of ${page.hello.taps}` : "\u2013")],
     ["another tap", "another_tap", "Whether one more tap is expected to make the error smaller.",
@@ -96,22 +92,14 @@ const NUMBERS = {
       ({ made }) => trustText(made)],
     ["mismatch", "mismatch", "Share of the readings that the pattern does not explain.",
       ({ made }) => amount(known(made.mismatch) ? 100 * made.mismatch : null, 1, "%")],
-    ["tap mismatch", "tap_mismatch", "The same for each earlier tap, against the newest one.",
-      ({ made }) => made.tap_mismatch?.map((share) => number(share, 2)).join(", ") || "\u2013"],
     ["90 % within", "interval_mm", "Nine of ten pixels are expected within this distance of the truth.",
       ({ made }) => (known(made.interval_mm) ? `\u00b1 ${amount(made.interval_mm, 3, "mm")}` : "\u2013")],
-    ["expected RMSE", "expected_rmse_mm", "Error of the pattern that the model itself expects.", ({ made }) => amount(made.expected_rmse_mm, 4, "mm")],
-    ["gains", "gains_certainty", "How well the gains of this sensor's taxels are known.",
-      ({ result }) => (known(result.gains_certainty) ? `${number(100 * result.gains_certainty)}${THIN}% certain` : "not known")],
   ],
   Timing: [
     ["rate", "rate_hz", "Scans a second from the sensor.", ({ result }) => amount(result.rate_hz, 1, "Hz")],
     ["run time", "run_time_us", "Time of one inference.", ({ made }) => amount(made.run_time_us, 0, "\u00b5s")],
     ["latency", "latency_us", "Time from the scan's last byte to its pattern; of a recording there is none.",
       ({ made }) => amount(known(made.latency_us) ? made.latency_us / 1000 : null, 2, "ms")],
-    ["pattern", "reused_from", "Whether the pattern was made of this scan, or the scan changed too little to make another.",
-      ({ made, sensor }) => (sensor.live() ? (known(made.reused_from) ? "unchanged" : "new") : "\u2013")],
-    ["model", "model", "Network that makes the patterns.", ({ result }) => result.model ?? "\u2013"],
   ],
   Losses: [
     ["dropped", "dropped", "Scans without a pattern, since a newer one was waiting. Their force is followed all the same."],
@@ -128,53 +116,5 @@ const NUMBERS = {
       ({ result }) => (result.baseline === null ? "\u2013" : duration(result.baseline_age_s))],
     ["drift x y z", "drift", "Drift of the free pad since it was zeroed, mean of all taxels.",
       ({ result }) => result.drift_counts?.common.map((counts) => number(counts, 1)).join(" ") ?? "\u2013"],
-    ["taxel, step", "own", "Largest drift of a single taxel, and the latest step of its rest level.",
-      ({ result: { drift_counts: drift } }) => (drift ? `${number(drift.own, 1)}, ${number(drift.step)} counts` : "\u2013")],
   ],
-};
-
-// ---- Explanations: by the pointer, by the keyboard, or by a tap ----
-
-function explain(element, text) {
-  element.dataset.tip = text;
-  element.tabIndex = element.matches("dt:not(:first-child)") ? -1 : 0; // one stop of the tab key for a list, whose arrow keys go on
-  element.setAttribute("aria-description", text);
-}
-
-const tip = {
-  of: null,
-  show(element) {
-    const bubble = byId("tip");
-    this.of = element;
-    say(bubble, element.dataset.tip);
-    show(bubble, true);
-    const [box, own] = [element.getBoundingClientRect(), bubble.getBoundingClientRect()];
-    const below = box.bottom + 6 + own.height < innerHeight;
-    bubble.style.left = `${Math.max(8, Math.min(box.left, innerWidth - own.width - 8))}px`;
-    bubble.style.top = `${below ? box.bottom + 6 : Math.max(8, box.top - own.height - 6)}px`;
-  },
-  hide() { this.of = null; show(byId("tip"), false); },
-  listen() {
-    const about = (event) => event.target.closest?.("[data-tip]") ?? null;
-    document.addEventListener("pointerover", (event) => {
-      if (event.pointerType !== "mouse") return;
-      const element = about(event);
-      if (element !== null) this.show(element); else if (this.of !== null) this.hide();
-    });
-    document.addEventListener("click", (event) => {
-      const element = about(event);
-      if (element !== null) this.show(element); else this.hide();
-    });
-    document.addEventListener("focusin", (event) => { if (about(event) !== null && event.target.matches(":focus-visible")) this.show(about(event)); });
-    document.addEventListener("focusout", () => this.hide());
-    document.addEventListener("scroll", () => this.hide(), { passive: true });
-    document.addEventListener("keydown", (event) => {
-      if (event.key === "Escape") this.hide();
-      const terms = event.target.matches?.("dt") ? [...event.target.parentElement.querySelectorAll("dt")] : [];
-      const to = terms[terms.indexOf(event.target) + ({ ArrowDown: 1, ArrowUp: -1 }[event.key] ?? NaN)];
-      if (to === undefined) return;
-      event.preventDefault();
-      to.focus({ focusVisible: true });
-    });
-  },
 };

@@ -10,7 +10,7 @@ const painter = {
     page.map.dirty = true;
     this.ask();
   },
-  /** Paint at once, also while paused: a canvas of a new size is blank. */
+  /** Paint at once: a canvas of a new size is blank. */
   resized() {
     for (const sensor of page.sensors.values()) sensor.paint();
     page.map.paintPads();
@@ -19,7 +19,7 @@ const painter = {
     this.asked = 0;
     paintPage();
     for (const sensor of page.sensors.values()) if (sensor.dirty) sensor.paint();
-    if (page.map.dirty && !page.paused) page.map.paint();
+    if (page.map.dirty) page.map.paint();
   },
 };
 
@@ -33,11 +33,8 @@ const page = {
   map: new MapPane(),
   state: {},
   eventNumber: 0, // number of the run's latest event that is in the log
-  paused: false,
-  pausedS: 0,
-  auto: memory.get("scale") !== "fixed",
-  shear: memory.get("shear") === "on",
-  spanS: memory.get("span") === "60" ? 60 : 10,
+  shear: false,
+  spanS: 10,
   asked: null, // latest request of this page to zero: {sensor, or undefined for all; untilS}
   forcible: new Set(), // sensors whose zeroing was refused, while it may be forced
   refusalTimer: 0,
@@ -84,11 +81,8 @@ function paintPage() {
   const about = byId("about");
   const modelNames = [...(models.size ? models : hello === null ? [] : [hello.model])];
   say(about, hello === null ? "" : [shortName(hello.name), ...modelNames].join(", "));
-  if (hello !== null) explain(about, [hello.name, ...modelNames].join(", "));
+  if (hello !== null) about.title = [hello.name, ...modelNames].join(", ");
   paintTrouble();
-  byId("pause").setAttribute("aria-pressed", String(page.paused));
-  byId("pause").firstChild.textContent = page.paused ? "Resume " : "Pause ";
-  say(byId("scale").firstElementChild, `Scale: ${page.auto ? "auto" : "fixed"}`);
   for (const id of ["zero", "reset", "force"]) byId(id).disabled = !link.up;
   show(byId("waiting"), page.sensors.size === 0);
   say(byId("waiting"), `Waiting for ${hello === null ? "edge-sr" : "the first scan"}`);
@@ -105,11 +99,10 @@ function paintTrouble() {
   const viewers = page.state.viewers > 1 ? `, ${page.state.viewers} viewers` : "";
   say(state, link.up ? `connected${viewers}${silent.length > 0 ? `; no scan from ${silent.map((sensor) => sensor.name).join(", ")}` : ""}` : page.hello === null && link.tries === 0 ? "connecting" : "not connected");
   const lost = !link.up && link.tries > 0;
-  show(trouble, lost || page.paused);
-  trouble.dataset.kind = lost ? "lost" : "pause";
+  show(trouble, lost);
   const since = ago(nowS() - page.lostS);
   const what = page.hello === null ? "no connection to edge-sr" : `${link.ended ? `the run has ended (${since})` : `connection lost ${since}`}: the values shown are old`;
-  say(trouble, lost ? [what, link.why, next].filter((text) => text !== null).join("; ") : `paused ${ago(nowS() - page.pausedS)}; the sensor continues. Press space to resume`);
+  if (lost) say(trouble, [what, link.why, next].filter((text) => text !== null).join("; "));
 }
 
 /** Return how far the recording is that is played. */
@@ -138,16 +131,12 @@ const frameHandlers = {
     if (page.hello !== null && page.hello.run !== header.run) forgetRun();
     page.hello = header;
     document.documentElement.style.setProperty("--pad", `${header.cols} / ${header.rows}`);
-    if (page.paused) page.link.send({ cmd: "pause", on: true });
   },
   result(header, maps) {
-    if (page.hello === null) return;
-    const sensor = sensorOf(header.sensor);
-    if (page.paused) sensor.trace.add(header.trace ?? []); // sent before the pause reached the program, and not again
-    else sensor.take(header, maps);
+    if (page.hello !== null) sensorOf(header.sensor).take(header, maps);
   },
   map(header, maps) {
-    page.map.take(header, maps); // also while paused: it is sent once
+    page.map.take(header, maps);
   },
   event({ note, event, sensor, number, age_s = 0 }) {
     if (number <= page.eventNumber) return; // a new connection, also a reconnect, gets the latest events again
@@ -193,7 +182,6 @@ function sensorOf(name) {
   if (!page.sensors.has(name)) {
     const later = [...page.sensors.values()].filter((other) => other.name.localeCompare(name, "en", { numeric: true }) > 0);
     const sensor = new Sensor(name);
-    sensor.trace.hold(page.paused);
     const next = [...byId("sensors").children].find((root) => later.some((other) => other.root === root));
     byId("sensors").insertBefore(sensor.root, next ?? null);
     page.sensors.set(name, sensor);
@@ -203,13 +191,12 @@ function sensorOf(name) {
   return page.sensors.get(name);
 }
 
-/** Forget the sensors, the pause and the events of a run: they do not belong to the next. */
+/** Forget the sensors and the events of a run: they do not belong to the next. */
 function forgetRun() {
   for (const sensor of page.sensors.values()) sensor.remove();
   page.sensors.clear();
   hand.arrange();
   page.map.forget();
-  page.paused = false;
   page.eventNumber = 0;
   forgetRefusal();
   log("a new run has begun");
@@ -233,40 +220,24 @@ const act = {
     forgetRefusal();
   },
   reset() { command({ cmd: "reset" }); },
-  pause() {
-    page.paused = !page.paused;
-    page.pausedS = nowS();
-    for (const sensor of page.sensors.values()) sensor.trace.hold(page.paused);
-    page.link.send({ cmd: "pause", on: page.paused });
-    painter.all();
-  },
   shear() {
     page.shear = !page.shear;
-    memory.set("shear", page.shear ? "on" : "off");
     painter.all();
   },
   before() { hand.step(-1); },
   after() { hand.step(1); },
   close() { hand.open(null); },
-  scale() {
-    page.auto = !page.auto;
-    for (const sensor of page.sensors.values()) sensor.highest = sensor.pattern ? largest(sensor.pattern.values) : 0;
-    memory.set("scale", page.auto ? "auto" : "fixed");
-    painter.all();
-  },
   span() {
     page.spanS = page.spanS === 10 ? 60 : 10;
-    memory.set("span", String(page.spanS));
     painter.all();
   },
   help() { if (!byId("manual").open) byId("manual").showModal(); },
 };
 
-const KEYS = { z: "zero", "shift z": "force", r: "reset", " ": "pause", s: "scale", t: "span", "?": "help", "[": "before", "]": "after", escape: "close" };
+const KEYS = { z: "zero", "shift z": "force", r: "reset", t: "span", "?": "help", "[": "before", "]": "after", escape: "close" };
 
 function pressed(event) {
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat || document.querySelector("dialog[open]")) return;
-  if (event.key === " " && event.target instanceof HTMLButtonElement) return; // the space bar presses that button
   const letter = event.key.toLowerCase(); // independent of Caps Lock
   const action = KEYS[event.shiftKey && /[a-z]/.test(letter) ? `shift ${letter}` : letter];
   if (action === undefined) return;
@@ -296,15 +267,14 @@ page.link = new Link({
   },
 });
 
-for (const id of ["zero", "force", "reset", "pause", "scale", "help"]) byId(id).onclick = () => act[id]();
-tip.listen();
+for (const id of ["zero", "force", "reset", "help"]) byId(id).onclick = () => act[id]();
 document.addEventListener("keydown", pressed);
 document.addEventListener("visibilitychange", () => { page.link.hurry(); painter.all(); });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => painter.all());
 // Only ages and waits change without a new frame.
 setInterval(() => {
   page.link.look();
-  const moving = !page.link.up || page.paused || [...page.sensors.values()].some((sensor) => !sensor.live());
+  const moving = !page.link.up || [...page.sensors.values()].some((sensor) => !sensor.live());
   if (moving) painter.all();
 }, 500);
 page.link.open();

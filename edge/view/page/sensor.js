@@ -2,7 +2,7 @@
 
 class Sensor {
   constructor(name) {
-    Object.assign(this, { result: null, receivedS: 0, zeroed: null, taps: null }); // of the newest scan
+    Object.assign(this, { result: null, receivedS: 0, zeroed: null }); // of the newest scan
     Object.assign(this, { pattern: null, deviation: null, truth: null, touched: null, touchedS: 0 }); // of the newest with a pattern
     Object.assign(this, { name, cursor: null, trace: new Trace(), silentS: null, highest: 0, noteKinds: "", dirty: true });
     const root = byId("sensor").content.firstElementChild.cloneNode(true);
@@ -12,7 +12,7 @@ class Sensor {
     root.setAttribute("aria-labelledby", this.part.name.id);
     root.dataset.sensor = name;
     say(this.part.name, `sensor ${name}`);
-    this.part.field.setAttribute("aria-label", `pattern of sensor ${name}; arrow keys read out a pixel`);
+    this.part.field.setAttribute("aria-label", `pattern of sensor ${name}`);
     this.part.taxels.setAttribute("aria-label", `taxels of sensor ${name}, z in colour and shear as arrows`);
     this.fields = this.addNumbers();
     this.sized = [this.part.over, this.part.shear, this.part["force-plot"], this.part["area-plot"]];
@@ -35,7 +35,7 @@ class Sensor {
         const term = list.appendChild(document.createElement("dt"));
         const element = list.appendChild(document.createElement("dd"));
         term.textContent = label;
-        explain(term, meaning);
+        term.title = meaning;
         element.dataset.number = key;
         if (key === "force" || key === "area") term.className = element.className = "big";
         fields[key] = { element, text };
@@ -55,8 +55,6 @@ class Sensor {
       this.point((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
     };
     field.onpointerleave = (event) => { if (event.pointerType === "mouse") this.point(null); }; // a finger's pixel stays
-    field.onblur = () => this.point(null);
-    field.onkeydown = (event) => this.steer(event);
   }
 
   remove() {
@@ -71,7 +69,7 @@ class Sensor {
     this.silentS = null;
     this.trace.add(header.trace ?? []);
     const receivedS = nowS() - (header.age_s ?? 0);
-    Object.assign(this, { result: header, receivedS, zeroed: maps.zeroed ?? null, taps: maps.taps ?? null });
+    Object.assign(this, { result: header, receivedS, zeroed: maps.zeroed ?? null });
     if (maps.pattern) Object.assign(this, { pattern: maps.pattern, deviation: maps.deviation ?? null, truth: maps.truth ?? null, touched: header, touchedS: receivedS });
     else if (header.baseline === null) this.pattern = this.deviation = null; // no earlier pattern is valid without a baseline
     if (maps.pattern) this.highest = largest(maps.pattern.values, this.highest);
@@ -99,22 +97,6 @@ class Sensor {
     this.cursor = inside ? [Math.floor(y * rows), Math.floor(x * cols)] : null;
     this.dirty = true;
     painter.ask();
-  }
-
-  steer(event) {
-    const steps = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] };
-    if (event.key === "Escape" && this.cursor !== null) return this.point(null);
-    const step = steps[event.key];
-    if (!step || event.ctrlKey || event.altKey || event.metaKey) return undefined;
-    event.preventDefault();
-    const stride = event.shiftKey ? 5 : 1;
-    const limits = this.size();
-    const from = this.cursor ?? limits.map((limit) => Math.floor(limit / 2));
-    this.cursor = from.map((place, axis) => Math.max(0, Math.min(limits[axis] - 1, place + stride * step[axis])));
-    this.dirty = true;
-    painter.ask();
-    announce(this.reading());
-    return undefined;
   }
 
   reading() {
@@ -145,10 +127,10 @@ class Sensor {
     return this.touchedS === this.receivedS || (this.result.state === "dropped" && this.receivedS - this.touchedS < 0.3);
   }
 
-  live() { return !this.unsure() && this.newest() && page.link.up && !this.away() && !page.paused; }
+  live() { return !this.unsure() && this.newest() && page.link.up && !this.away(); }
 
-  /** True if the pattern is shown in grey, as where the baseline is in doubt; while paused it keeps its colours. */
-  old() { return this.unsure() || (this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest())); }
+  /** True if the pattern is shown in grey, as where the baseline is in doubt. */
+  old() { return this.unsure() || (this.pattern !== null && !this.live()); }
 
   /** Return the result of the pattern shown if that is the newest; else the newest result. */
   made() { return this.newest() ? this.touched : this.result; }
@@ -172,11 +154,8 @@ class Sensor {
     return known(own) ? amount(own, 2, "N") : `${amount(nominal(this.result?.force_counts), 2, "N")} nominal`;
   }
 
-  ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, page.hello.pixel_pitch_mm, page.hello.contact_level); }
-
   word() {
     if (!page.link.up) return ["lost", lostWord()];
-    if (page.paused) return ["paused", "paused"];
     if (this.result === null) return ["silent", this.silentS === null ? "no scan yet" : "no scan"];
     if (this.away()) return ["silent", `no scan for ${duration(this.silentS ?? this.ageS())}`];
     if (this.unsure()) return ["doubted", "baseline in doubt"];
@@ -198,7 +177,6 @@ class Sensor {
     this.paintPattern();
     this.paintTaxels();
     this.paintDeviation();
-    this.paintTaps();
     this.paintTraces();
     this.paintNumbers();
   }
@@ -233,23 +211,19 @@ class Sensor {
     say(this.part.link, !page.link.up ? "no connection" : up ? `${known(rate) ? amount(rate, 0, "scans/s") : "scans come"}` : away);
   }
 
-  high() {
-    const full = page.hello.full_scale || 1;
-    return page.auto ? Math.max(this.highest, 0.02) : full;
-  }
+  high() { return Math.max(this.highest, 0.02); }
 
   paintPattern() {
     const { pattern, field, stamp, over, readout } = this.part;
     const [unit, high, live] = [this.unit(), this.high(), this.live()];
     field.classList.toggle("old", this.old());
-    stamp.classList.toggle("aside", page.paused);
     field.dataset.live = live ? "yes" : "no";
     say(stamp, this.stampText());
     show(stamp, this.unsure() || !live);
-    say(this.part["pattern-high"], `${number(high, high < 0.1 ? 3 : 2)}${THIN}${unit}, ${page.auto ? "largest so far" : "full scale"}`);
+    say(this.part["pattern-high"], `${number(high, high < 0.1 ? 3 : 2)}${THIN}${unit}, largest so far`);
     paintMap(pattern, this.pattern, high, PATTERN_COLOURS);
     const most = this.pattern !== null && live ? largest(this.pattern.values) : null;
-    say(this.part["pattern-most"], most === null ? "" : `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}`);
+    say(this.part["pattern-most"], most === null ? "" : `deepest ${amount(most, 3, unit)}`);
     this.paintTruth(high);
     const verdict = this.verdict();
     show(this.part.verdict, verdict !== null);
@@ -257,7 +231,7 @@ class Sensor {
     this.root.classList.toggle("doubted", this.doubted());
     paintOver(this, over, live);
     readout.classList.toggle("read", this.cursor !== null);
-    say(readout, this.cursor === null ? (matchMedia("(hover: none)").matches ? "tap the pattern to read a pixel" : "hover, or use the arrow keys, to read a pixel") : this.reading());
+    say(readout, this.cursor === null ? (matchMedia("(hover: none)").matches ? "tap the pattern to read a pixel" : "hover to read a pixel") : this.reading());
   }
 
   paintTruth(high) {
@@ -271,7 +245,6 @@ class Sensor {
 
   stampText() {
     if (this.unsure()) return `${this.result.note} (key z)`;
-    if (page.paused && this.newest()) return `paused ${ago(nowS() - page.pausedS)}`;
     if (this.pattern === null) return this.result === null ? "no scan yet" : this.result.baseline === null ? this.result.note ?? "no baseline yet" : "no contact yet";
     return `last contact ${ago(nowS() - this.touchedS)}`;
   }
@@ -311,20 +284,6 @@ class Sensor {
     say(this.part["deviation-high"], high === null ? this.unit() : `${short(high)}${THIN}${this.unit()}`);
   }
 
-  paintTaps() {
-    const { thumbs } = this.part;
-    const slots = Math.max(page.hello.taps || 1, this.taps?.shape[0] ?? 0);
-    while (thumbs.children.length > slots) thumbs.lastChild.remove();
-    while (thumbs.children.length < slots) thumbs.append(thumb(thumbs.children.length));
-    const [there, rows, cols] = this.taps?.shape ?? [0, page.hello.rows, page.hello.cols];
-    const high = there ? largest(this.taps.values, LEAST_COUNTS) : 1;
-    [...thumbs.children].forEach((item, tap) => {
-      item.classList.toggle("empty", tap >= there);
-      const map = tap < there ? { values: this.taps.values.subarray(tap * rows * cols, (tap + 1) * rows * cols), shape: [rows, cols] } : null;
-      paintMap(item.firstChild, map, high, TAXEL_COLOURS);
-    });
-  }
-
   paintTraces() {
     const newtons = this.inNewtons();
     const span = page.spanS;
@@ -343,9 +302,8 @@ class Sensor {
     const made = this.made();
     if (result === null) return;
     const counters = result.counters ?? {};
-    const ellipse = made.state === "contact" && made.trusted !== false && this.newest() ? this.ellipse() : null;
     for (const [key, { element, text }] of Object.entries(this.fields)) {
-      say(element, text?.({ sensor: this, result, made, ellipse }) ?? String(counters[key] ?? 0));
+      say(element, text?.({ sensor: this, result, made }) ?? String(counters[key] ?? 0));
       // Fewer losses, as in the first second of a run, are no reason to worry.
       if (!text) element.classList.toggle("warn", counters[key] > 0.01 * (counters.scans ?? 0));
     }

@@ -2,7 +2,7 @@
 
 const STEP_S = 0.01; // closer scans share a point, which keeps the larger value
 const GAP_S = 0.3;
-const POINTS = 66 / STEP_S; // the longest span, and some more for a trace that is held
+const POINTS = 66 / STEP_S; // the longest span, and some more
 
 /** Return the force of counts in newtons by the nominal sensitivity; as counts where the model states none. */
 const nominal = (counts) => (known(counts) ? counts / (page.hello.nominal_counts_per_newton ?? 1) : null);
@@ -14,18 +14,12 @@ class Trace {
     this.series = { force: new Float32Array(POINTS), area_mm2: new Float32Array(POINTS), shear_ratio: new Float32Array(POINTS) };
     this.next = this.count = 0;
     this.newestS = -Infinity;
-    this.heldS = null;
   }
-
-  /** Hold the trace: newer points are stored for later, but not shown, nor merged with those shown. */
-  hold(on) { this.heldS = on ? this.newestS : null; }
-
-  get endS() { return this.heldS ?? this.newestS; }
 
   add(points) {
     for (const [atS, forceCounts, areaMm2, forceN, shearRatio] of points) {
-      if (atS < this.newestS || (this.heldS !== null && atS <= this.heldS)) continue; // a new connection gets the last minute again
-      const same = this.count > 0 && this.newestS !== this.heldS && atS - this.newestS < 0.5 * STEP_S;
+      if (atS < this.newestS) continue; // a new connection gets the last minute again
+      const same = this.count > 0 && atS - this.newestS < 0.5 * STEP_S;
       const place = same ? (this.next + POINTS - 1) % POINTS : this.next;
       const values = [forceN ?? nominal(forceCounts), areaMm2, shearRatio];
       Object.values(this.series).forEach((series, which) => {
@@ -41,11 +35,11 @@ class Trace {
 
   /** Call visit(time, value) for each point of the last `spanS` seconds, oldest first. */
   each(name, spanS, visit) {
-    const [series, endS] = [this.series[name], this.endS];
+    const series = this.series[name];
     for (let back = this.count; back > 0; back--) {
       const place = (this.next + POINTS - back) % POINTS;
       const atS = this.time[place];
-      if (atS <= endS && endS - atS <= spanS) visit(atS, series[place]);
+      if (this.newestS - atS <= spanS) visit(atS, series[place]);
     }
   }
 }
@@ -78,7 +72,7 @@ function paintTrace(canvas, trace, name, spanS, least, ink, unit) {
   trace.each(name, spanS, (_, value) => { if (value > high) high = value; if (value < low) low = value; });
   high = roundUp(1.03 * high);
   low = low < -0.02 * high ? -roundUp(-low) : 0;
-  const x = (atS) => right - ((trace.endS - atS) / spanS) * (right - left);
+  const x = (atS) => right - ((trace.newestS - atS) / spanS) * (right - left);
   const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);
   context.font = FONT;
   context.fillStyle = colour("quiet");
