@@ -31,7 +31,7 @@ class Out(Flag):
     """Outputs that hold a field, in addition to shared memory, where a field has a byte.
 
     Attributes:
-        RECORD: the JSON record, and with it zenoh, MCAP, ROS 2 and the live page.
+        RECORD: the JSON record, and with it zenoh, MCAP, the live page and, of a single value, ROS diagnostics.
         NPZ: arrays that `edge-sr convert` makes of a recording.
         ROS: members of tactile_edge_sr/msg/Result.
         MAP: maps next to the record: in lines of JSON, in packed messages and as grids of MCAP.

@@ -19,6 +19,7 @@ from sink_samples import (
     RUN,
     Jsonl,
     Mcap,
+    Ros2,
     every_kind,
     make_results,
     make_sure_results,
@@ -52,6 +53,8 @@ def test_each_kind_of_result_and_event_comes_back(opened):
     assert sink.unwritten == 0
     opened.close()
     found, expected = opened.results(), [told(result) for result in results]
+    if isinstance(opened, Ros2):
+        expected = [one._replace(scan=None, force_counts=None) for one in expected if one.state != "dropped"]
     for got, wanted in zip(found, expected, strict=True):
         near = (got.highest, got.force_counts) == pytest.approx((wanted.highest, wanted.force_counts), abs=0.051)
         assert near and got[:5] == wanted[:5]

@@ -36,7 +36,7 @@ TOPICS = {
     "skin/s4/state": STRING,
     "skin/s4/trusted": "std_msgs/msg/Int8",
     "skin/s4/area_m2": FLOAT,
-    "skin/s4/record": STRING,
+    "skin/s4/centroid": "geometry_msgs/msg/PointStamped",
     "skin/left/s4/pattern": IMAGE,
     "skin/left/s4/wrench": WRENCH,
     "skin/events": STRING,
@@ -105,8 +105,7 @@ def test_subscribers_get_exact_patterns_and_hear_of_their_end(sink):
         assert {message["data"] for message in listener.of("skin/s4/state")} == {"contact"}
         assert {message["data"] for message in listener.of("skin/s4/trusted")} == {1}
         assert {message["data"] for message in listener.of("skin/s4/area_m2")} == {4e-5}
-        told = json.loads(listener.of("skin/s4/record")[-1]["data"])
-        assert (told["centroid_mm"], told["trusted"], told["counters"]) == ([1.5, -2.0], True, {"dropped": 7})
+        assert listener.of("skin/s4/centroid")[-1]["point"] == {"x": 0.0015, "y": -0.002, "z": 0.0}
 
         # The end of a contact is reported once, by zeros; lost readings by NaN.
         four = contact(1000)

@@ -17,19 +17,20 @@ import numpy as np
 import ros2_messages
 import yaml
 from cyclonedds.idl import IdlStruct, types
-from edge_samples import ROOT, fake_source, make_contract, make_scan, make_wrench_result
+from edge_samples import BASELINE, ROOT, fake_source, make_contract, make_scan, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import make_results, odd_scans
 from ros2_samples import ENVIRONMENT, contact, keep_published, sink
 
-from edge.api import USPA44, Event, SinkError, UsageError
+from edge.api import USPA44, Event, Note, Result, SinkError, UsageError
 from edge.cli.main import parser
 from edge.sinks.json_records import record
 from edge.sinks.registry import check_sink
 from edge.sinks.ros2 import map_messages
 from edge.sinks.ros2 import messages as ros_messages
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
+from edge.sinks.ros2.diagnostics import ERROR, OK, STALE, WARN
 from edge.sinks.ros2.messages import LONGEST_TOPIC, base_topic, sensor_topic
 from edge.sinks.ros2.sink import Ros2Sink
 from firmware_bridge.errors import CdrError
@@ -54,6 +55,44 @@ def kept(kind="device", *, unix_offset_ns=None, **settings):
     sink = Ros2Sink("skin", make_contract(), source, environment=ENVIRONMENT, clock_ns=clock, **settings)
     keep_published(sink, published)
     return sink, published, clock
+
+
+def test_diagnostics_come_once_a_second_and_say_why_it_is_silent():
+    sink, published, clock = kept()
+    idle = Result(make_scan(1), "device", "m", "idle", contact=False, baseline=BASELINE, baseline_age_s=3.0)
+
+    def written(**changes):
+        clock.now_ns += 1_000_000_000
+        scan = replace(idle.scan, time_ns=clock.now_ns)
+        sink.write(replace(idle, scan=scan, **changes), {"dropped": 2})
+        return statuses()
+
+    def statuses():
+        taken = [status for message in published for status in message.get("status", ())]
+        published.clear()
+        return [(status["level"], status["message"]) for status in taken]
+
+    assert written() == [(WARN, "2 dropped")]
+    for _ in range(99):
+        clock.now_ns += 10_000_000
+        sink.write(replace(idle, scan=replace(idle.scan, time_ns=clock.now_ns)), {"dropped": 2})
+    assert statuses() == []
+    assert written() == [(OK, "idle")]
+    sink.tell(Event(clock.now_ns, "trouble", None, "bus-off"), {"dropped": 2})
+    clock.now_ns += 1_500_000_000
+    sink.wait()
+    sink.wait()
+    assert statuses() == [(STALE, "no scan for 2 s; bus-off")]
+    sink.tell(Event(clock.now_ns, "well", None, "well again"), {"dropped": 2})
+    sink.tell(Event(clock.now_ns, "silent", "5", "another is silent"), {"dropped": 2})
+    assert written(dead={3: "stuck"}) == [(WARN, "without taxel 3 (stuck)")]
+    ((level, text),) = written(state="contact", trusted=False, untrusted_reason="unexplained")
+    assert level == WARN and text.startswith("pattern not to be believed: the pattern does not explain its readings")
+    doubt = {"state": "baseline_in_doubt", "contact": None, "notes": (Note("baseline_in_doubt", "why"),)}
+    assert written(**doubt) == [(ERROR, "why")]
+    sink.tell(Event(clock.now_ns, "lost", None, "the plug is out"), {})
+    sink.close()
+    assert statuses()[-1] == (STALE, "ended")
 
 
 def stamps_ns(published):

@@ -242,11 +242,17 @@ class Ros2(Opened):
     def look(self) -> None:
         texts = [one["data"] for one in self._kept if isinstance(one.get("data"), str)]
         said = [json.loads(text) for text in texts if text.startswith("{")]
-        self._events += [(one["event"], one["note"]) for one in said if one["state"] == "event" and not one["sensor"]]
-        for record in (one for one in said if one["state"] != "event"):
+        self._events += [(one["event"], one["note"]) for one in said if one["sensor"] is None]
+        states = [text for text in texts if not text.startswith("{")]
+        frames = [one["header"]["frame_id"] for one in self._kept if one.get("encoding") and one["height"] == 12]
+        if frames and states:  # nothing is said of a scan that was dropped
+            source, _, sensor = frames[0].rpartition("/")
+            trusted = [one["data"] for one in self._kept if type(one.get("data")) is int]
+            known = {-1: None, 0: False, 1: True}[trusted[0]]
             images = [one["data"] for one in self._kept if one.get("encoding") and one["height"] == 40]
-            values = np.frombuffer(bytes(images[0]), "<f4") * 1e3 if images else np.zeros(1)
-            self._found.append(of_record(record, None if np.isnan(values).any() or not values.any() else values))
+            values = np.frombuffer(bytes(images[0]), "<f4") if images else np.zeros(1)
+            highest = round(float(values.max()) * 1e3, 6) if values.any() and not np.isnan(values).any() else None
+            self._found.append(Back(sensor, None, source or "device", states[0], known, None, highest))
         self._kept.clear()
 
     def results(self) -> list[Back]:

@@ -34,6 +34,7 @@ _TYPE_FIELDS: Final = {
     "sensor_msgs/PointCloud2": "std_msgs/Header header, uint32 height, uint32 width, sensor_msgs/PointField[] fields, "
     "bool is_bigendian, uint32 point_step, uint32 row_step, uint8[] data, bool is_dense",
     "geometry_msgs/Point": "float64 x, float64 y, float64 z",
+    "geometry_msgs/PointStamped": "std_msgs/Header header, geometry_msgs/Point point",
     "geometry_msgs/Quaternion": "float64 x, float64 y, float64 z, float64 w",
     "geometry_msgs/Pose": "geometry_msgs/Point position, geometry_msgs/Quaternion orientation",
     "foxglove_msgs/Vector2": "float64 x, float64 y",
@@ -48,6 +49,10 @@ _TYPE_FIELDS: Final = {
     "geometry_msgs/TransformStamped": "std_msgs/Header header, string child_frame_id, "
     "geometry_msgs/Transform transform",
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "diagnostic_msgs/KeyValue": "string key, string value",
+    "diagnostic_msgs/DiagnosticStatus": "byte level, string name, string message, string hardware_id, "
+    "diagnostic_msgs/KeyValue[] values",
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header, diagnostic_msgs/DiagnosticStatus[] status",
 }
 """Fields of each type, each after the types in it."""
 
@@ -69,7 +74,9 @@ WRENCH_STAMPED: Final = TYPES["geometry_msgs/WrenchStamped"]
 LOG: Final = TYPES["rcl_interfaces/Log"]
 STRING: Final = TYPES["std_msgs/String"]
 POINT_CLOUD: Final = TYPES["sensor_msgs/PointCloud2"]
+POINT_STAMPED: Final = TYPES["geometry_msgs/PointStamped"]
 TF_MESSAGE: Final = TYPES["tf2_msgs/TFMessage"]
+DIAGNOSTIC_ARRAY: Final = TYPES["diagnostic_msgs/DiagnosticArray"]
 
 
 def header(frame: str, unix_ns: int) -> dict[str, Any]:

@@ -21,18 +21,22 @@ from edge.perception.result import Result
 from edge.pipeline.commands import Command, Commands, runtime_command
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.sinks.json_records import event_record, record
+from edge.sinks.json_records import event_record
 from edge.sinks.ros2.dds_domain import join, reader, taken, writer
+from edge.sinks.ros2.diagnostics import OUTAGES, Diagnostics
 from edge.sinks.ros2.map_messages import contacts, image, in_si, points, taxels
 from edge.sinks.ros2.messages import (
+    DIAGNOSTIC_ARRAY,
     IMAGE,
     POINT_CLOUD,
+    POINT_STAMPED,
     STRING,
     TF_MESSAGE,
     TYPES,
     WRENCH_STAMPED,
     base_topic,
     frame_of,
+    header,
     sensor_topic,
     transforms,
     wrench,
@@ -42,7 +46,6 @@ from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
 
 _COMMANDS_KEPT: Final = 16
-_OUTAGES: Final = ("lost", "silent")
 NUMBERS: Final[Mapping[str, Callable[[Result], float | None]]] = {
     "force_counts": lambda result: result.force_counts,
     "force_z_n": lambda result: result.force_n if result.wrench is None else result.wrench.force_n[2],
@@ -65,7 +68,7 @@ class _Sensor:
 
 
 class Ros2Sink(Sink):
-    """Publisher of patterns, taxels, forces, numbers, records and events; with the run's commands a subscriber too.
+    """Publisher of patterns, taxels, forces, numbers, diagnostics and events; with the run's commands a subscriber too.
 
     Commands are texts on TOPIC/zero and TOPIC/reset, as any node or `ros2 topic pub` writes them. Topics serve nodes of
     every middleware; a service's calls are understood by those of one vendor alone.
@@ -82,7 +85,7 @@ class Ros2Sink(Sink):
         clock_ns: Callable[[], int] = time.monotonic_ns,
         unix_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Join the domain of the environment; `topic` is the first part of all topics but that of frames.
+        """Join the domain of the environment; `topic` is the first part of all topics but diagnostics and frames.
 
         `clock_ns` is the clock of scans of now; wall time is read once, because the clock may be set during the run.
         """
@@ -96,6 +99,8 @@ class Ros2Sink(Sink):
         self._sensors: dict[str, _Sensor] = {}
         self._domain, self._participant = join(environment)
         self._events = writer(self._participant, f"{self._base}/events", STRING, depth=100)
+        self._diagnosed_ns, self._diagnostics = clock_ns(), Diagnostics(self._base)
+        self._states = writer(self._participant, "diagnostics", DIAGNOSTIC_ARRAY)  # the topic of ROS's own tools
         self._placed = writer(self._participant, "tf_static", TF_MESSAGE, latched=True) if self._frames else None
         self._asked = None if commands is None else self._subscribed(commands)
 
@@ -119,26 +124,35 @@ class Ros2Sink(Sink):
             sensor.forced = result.wrench is not None
         if result.state != "dropped":
             self._publish_numbers(sensor, result, result.state)
-        self._publish_to(sensor, "record", STRING, lambda: _as_text(record(result, counters)))
         for event in result.events:
             self._tell(event, counters)
+        self._diagnostics.follow(result, counters)
+        self.wait()
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Publish an event; values that an outage makes unknown are published as NaN."""
         for name, sensor in self._sensors.items():
-            if event.kind in _OUTAGES and event.sensor in (None, name) and name.startswith(event.sensors):
+            if event.kind in OUTAGES and event.sensor in (None, name) and name.startswith(event.sensors):
                 self._clear_of_all(sensor, event.time_ns, event.kind)
         self._tell(event, counters)
+        self._diagnostics.tell(event, counters)
+        self.wait()
+
+    def wait(self) -> None:
+        """Publish the diagnostics once a second, also while no scan comes."""
+        if self._clock_ns() - self._diagnosed_ns >= 1e9:
+            self._diagnose()
 
     def close(self) -> None:
         """Publish that the run has ended, and leave the domain."""
         for sensor in self._sensors.values():
             self._clear_of_all(sensor, self._now_ns(), "ended")
+        self._diagnose(ended=True)
         self._sensors.clear()
         if self._asked is not None:
             self._asked.clear()
         # Each is deleted with its last reference: writers before the participant, the participant before its domain.
-        del self._events, self._placed, self._participant, self._domain
+        del self._states, self._events, self._placed, self._participant, self._domain
 
     def _subscribed(self, commands: Commands) -> dict[str, Any]:
         """Return the readers of commands by name; the loop reads them before each scan, for they have no thread."""
@@ -188,6 +202,10 @@ class Ros2Sink(Sink):
             if values is not None:
                 self._publish_to(sensor, name, IMAGE, partial(image, in_si(name, values), frame, unix_ns))
                 sensor.shown[name] = values.shape
+        if result.centroid_mm is not None:
+            x, y = (place / 1e3 for place in result.centroid_mm)
+            message = {"header": header(frame, unix_ns), "point": {"x": x, "y": y, "z": 0.0}}
+            self._publish_to(sensor, "centroid", POINT_STAMPED, lambda: POINT_STAMPED.encode(message))
         self._publish_to(sensor, "points", POINT_CLOUD, lambda: points(result, self._geometry, frame, unix_ns))
         find_patches = partial(patches, result, self._contract)  # as long as the pattern takes: only for a subscriber
         self._publish_to(sensor, "contacts", POINT_CLOUD, lambda: contacts(find_patches(), frame, unix_ns))
@@ -237,17 +255,19 @@ class Ros2Sink(Sink):
             self.publish(self._placed, transforms(frames, self._now_ns() + self.unix_offset_ns))
 
     def _tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        self.publish(self._events, _as_text(event_record(event, counters, self._source)))
+        text = orjson.dumps(event_record(event, counters, self._source)).decode()
+        self.publish(self._events, STRING.encode({"data": text}))
+
+    def _diagnose(self, *, ended: bool = False) -> None:
+        self._diagnosed_ns, now_ns = self._clock_ns(), self._now_ns()
+        made = self._diagnostics.message(now_ns + self.unix_offset_ns, now_ns if self._of_now else None, ended=ended)
+        self.publish(self._states, made)
 
     def _now_ns(self) -> int:
         """Return the time on the scans' clock; where that is of another time, the time of the newest scan."""
         if self._of_now:
             return self._clock_ns()
         return max((sensor.last.scan.time_ns for sensor in self._sensors.values()), default=0)
-
-
-def _as_text(fields: Mapping[str, Any]) -> bytes:
-    return STRING.encode({"data": orjson.dumps(fields, option=orjson.OPT_SERIALIZE_NUMPY).decode()})
 
 
 def _command(name: str, message: bytes) -> Command | None:
