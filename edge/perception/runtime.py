@@ -20,8 +20,7 @@ from edge.perception.event import OLD_NS, UNCHECKED, Event, EventKind, age_notes
 from edge.perception.gain_learning import ContactModel, Learn
 from edge.perception.pattern_description import Describe
 from edge.perception.result import Estimate, LastPattern, Result, Step, Window
-from edge.perception.tap_tracker import TapTracker
-from edge.perception.taps import Taps
+from edge.perception.taps import Taps, TapTracker
 from edge.perception.taxel_health import Health, TaxelEstimator
 from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.perception.zeroing import BaselineDoubt, Zeroing
@@ -63,7 +62,7 @@ class Sensor:
         self._name = name
         self._received_ns: int | None = None
         self._check, self._options = check, options
-        self.tracker = TapTracker(contract.taps, options, (geometry.rows, geometry.cols))
+        self.tracker = TapTracker(contract.taps, options)
         self._health = Health((geometry.rows, geometry.cols), mounting, runtime.estimator)
         notes = notes_on_missing(name, runtime.mountings, runtime.baselines)
         self._zeroing = Zeroing(self.tracker, self._health, mounting, self.report, runtime.unix_time_s, notes)
@@ -153,8 +152,7 @@ class Sensor:
                 due.tap, newest, made.pattern, about[0] if about else None, made.traction, self._health.most_repeats
             )
         self._describe(made, due.tap, newest, about)
-        if self._taps.advice is not None:
-            self._taps.advice.see(step, due.tap)
+        self._taps.see(due.tap, step.force_counts or 0.0, None if made.trusted is False else step.pose)
         if self.learn is not None and self.learn(step, made, due.counts[0], self._health.dead):
             self.last = None  # it was made with other gains
 

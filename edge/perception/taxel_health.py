@@ -29,6 +29,9 @@ HOLD_NS: Final = 90_000_000
 half a second ago is another press. A reading may have arrived 60 ms before the end of its scan, the longest pause
 inside one, so no held reading is older than 150 ms. The time counts from when the reading was taken, since a reader
 that was kept from running cannot date its arrival."""
+REPEATS: Final = 5
+"""Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
+longer than 3."""
 STUCK_SCANS: Final = 20
 """Repeats of a taxel in a row that make it stuck. A living taxel sends the same three counts twice in a quarter of the
 scans in which a quarter of the taxels are new, as torn as real grips are at their source, and no run there is longer

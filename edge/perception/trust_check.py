@@ -19,7 +19,8 @@ from edge.inference.contract import Contract
 from edge.inference.trust_model import Trust, contact_features, pose_tap_features
 from edge.perception.event import Report
 from edge.perception.result import Reason, Window, WrenchOrigin
-from edge.perception.tap_tracker import TapTracker
+from edge.perception.taps import TapTracker
+from edge.perception.taxel_health import REPEATS
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 from firmware_bridge.sensor_file.model import with_scale
@@ -32,9 +33,6 @@ MOST_DOUBT: Final = 0.61
 """RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
 
 With the others 3.5 % of simulated contacts less than 30 % off are not believed, and 34 % of those over 50 % off."""
-REPEATS: Final = 5
-"""Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
-longer than 3."""
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
 
 

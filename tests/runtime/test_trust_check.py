@@ -12,10 +12,10 @@ from edge.api import Pad
 from edge.inference.contract import ANY_BATCH, scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
+from edge.perception.taxel_health import REPEATS
 from edge.perception.trust_check import (
     LEAST_COUNTS,
     MOST_MISMATCH,
-    REPEATS,
     PatternCheck,
     SensorPad,
     TrustVerdict,
