@@ -26,12 +26,12 @@ OUTPUT_NAME: Final = "pattern"
 DEVIATION_NAME: Final = "deviation"
 TRACTION_NAME: Final = "traction"
 ANY_BATCH: Final = "any"
-"""Batch of a graph that takes any number of windows in one run; its first dimension bears this name."""
+"""Name of the first dimension of every input and output: a graph takes any number of windows in one run."""
 ANY_TAPS: Final = "taps"
 """Name of the second dimension of window and poses of a graph that takes poses: 1 to K taps in one run."""
 ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
-MOST: Final = MappingProxyType({"batch": 1024, "taps": 64, "scale": 256, "rows": 64, "cols": 64})
+MOST: Final = MappingProxyType({"taps": 64, "scale": 256, "rows": 64, "cols": 64})
 MOST_PIXELS: Final = 1 << 20
 LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
@@ -58,7 +58,6 @@ class Contract:
     """
 
     version: int
-    batch: int | str
     taps: int
     scale: int
     tap_order: str
@@ -89,13 +88,13 @@ class Contract:
 
     @property
     def window_shape(self) -> Shape:
-        """Shape of the window: (batch, 3 taps, rows, cols), a tap's x, y, z side by side.
+        """Shape of the window: (any, 3 taps, rows, cols), a tap's x, y, z side by side.
 
-        With poses it is (batch, taps, 3, rows, cols), of as many taps as there are.
+        With poses it is (any, taps, 3, rows, cols), of as many taps as there are.
         """
         if self.takes_poses:
-            return (self.batch, ANY_TAPS, len(AXES), self.rows, self.cols)
-        return (self.batch, 3 * self.taps, self.rows, self.cols)
+            return (ANY_BATCH, ANY_TAPS, len(AXES), self.rows, self.cols)
+        return (ANY_BATCH, 3 * self.taps, self.rows, self.cols)
 
     @property
     def pattern_shape(self) -> tuple[int, int]:
@@ -123,19 +122,19 @@ class Contract:
         """Shapes of the graph's inputs by name: the window, and the poses and the pad if the model takes them."""
         shapes: dict[str, Shape] = {INPUT_NAME: self.window_shape}
         if self.takes_poses:
-            shapes[POSES_NAME] = (self.batch, ANY_TAPS, POSE_WIDTH)
+            shapes[POSES_NAME] = (ANY_BATCH, ANY_TAPS, POSE_WIDTH)
         if self.pad_width:
-            shapes[PAD_NAME] = (self.batch, self.pad_width)
+            shapes[PAD_NAME] = (ANY_BATCH, self.pad_width)
         return shapes
 
     @property
     def output_shapes(self) -> dict[str, Shape]:
         """Shapes of the graph's outputs by name: the pattern, and its deviation and the traction if there are any."""
-        shapes: dict[str, Shape] = {OUTPUT_NAME: (self.batch, *self.pattern_shape)}
+        shapes: dict[str, Shape] = {OUTPUT_NAME: (ANY_BATCH, *self.pattern_shape)}
         if self.interval_factor is not None:
-            shapes[DEVIATION_NAME] = (self.batch, *self.pattern_shape)
+            shapes[DEVIATION_NAME] = (ANY_BATCH, *self.pattern_shape)
         if self.traction_shape is not None:
-            shapes[TRACTION_NAME] = (self.batch, *self.traction_shape)
+            shapes[TRACTION_NAME] = (ANY_BATCH, *self.traction_shape)
         return shapes
 
     def to_metadata(self) -> dict[str, str]:
@@ -270,8 +269,7 @@ def _check(values: Mapping[str, Any]) -> None:
 def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
     """Yield a key, whether its value is lawful, and the expected value; a rule may rely on those before it."""
     for key, most in MOST.items():
-        any_batch = key == "batch" and values[key] == ANY_BATCH
-        yield key, any_batch or _is_whole(values[key], most), f"a whole number from 1 to {most}"
+        yield key, _is_whole(values[key], most), f"a whole number from 1 to {most}"
     taxels = values["rows"] * values["cols"]
     yield "scale", taxels * values["scale"] ** 2 <= MOST_PIXELS, f"patterns of at most {MOST_PIXELS} pixels"
     yield "tap_order", values["tap_order"] == TAP_ORDER, repr(TAP_ORDER)

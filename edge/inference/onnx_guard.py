@@ -1,20 +1,14 @@
-"""Guards of loading a model: its file is one plain graph with its own weights, of bounded size, and loads in time.
+"""Guard of loading a model: its file is one plain graph with its own weights, of bounded size.
 
 onnxruntime follows a tensor into a side file, and a graph into graphs within it, which may run for ever. The walk
 covers the fields that lead to them and to the operators, skips all else, and refuses what it does not understand.
 Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
-
-While onnxruntime loads a graph, and during its first run, Python handles no signal on the calling thread. So loading
-has a thread of its own, and the calling one only waits, and gives up in time.
 """
 
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, wait
+from collections.abc import Iterator, Mapping
 from math import prod
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 from edge.errors import ModelError
 from firmware_bridge.in_place import read_bounded
@@ -168,53 +162,3 @@ def _varint(content: bytes, position: int, end: int, most_bytes: int) -> tuple[i
         if byte < 0x80:
             return value, position
     raise ModelError(_BROKEN)
-
-
-LOAD_LIMIT_S: Final = 60.0  # longest load: a thousand times that of the bundled models
-STOP_S: Final = 0.5
-"""Time that each part of a load may still take after a stop was requested: two in a row come before an end by force."""
-_POLL_S: Final = 0.1
-_THREAD: Final = "edge: loading a model"
-
-Made = TypeVar("Made")
-
-
-def within_limit(
-    work: Callable[[], Made],
-    path: Path,
-    stop: threading.Event | None = None,
-    give_up: Callable[[], object] = lambda: None,
-) -> Made:
-    """Do a part of loading a model on another thread, and return its value or raise its exception.
-
-    Abandoned work goes on until it ends, `give_up` ends it without waiting for that, or the program ends.
-
-    Raises:
-        ModelError: it was not done within LOAD_LIMIT_S, or STOP_S after `stop`.
-    """
-    made = Future[Made]()
-
-    def run() -> None:
-        try:
-            made.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - raised below, on the thread that waits
-            made.set_exception(error)
-
-    threading.Thread(target=run, name=_THREAD, daemon=True).start()
-    until_s, asked_s = time.monotonic() + LOAD_LIMIT_S, None
-    while not wait([made], _POLL_S).done:
-        now_s = time.monotonic()
-        if asked_s is None and stop is not None and stop.is_set():
-            asked_s = now_s
-        if asked_s is not None and now_s > asked_s + STOP_S:
-            give_up()
-            raise ModelError(f"{path}: stopped before it was loaded")
-        if now_s > until_s:
-            give_up()
-            raise ModelError(f"{path}: not loaded within {LOAD_LIMIT_S:g} s: export a smaller graph")
-    return made.result()
-
-
-def unfinished_load() -> bool:
-    """Return whether an abandoned load goes on; `os._exit` must end the program then, or onnxruntime may crash."""
-    return any(thread.name == _THREAD for thread in threading.enumerate())

@@ -227,9 +227,12 @@ class TestModels:
         nodes = [
             helper.make_node("ConstantOfShape", ["shape"], ["huge"]),
             helper.make_node("ReduceSum", ["huge"], ["sum"], keepdims=0),
-            helper.make_node("Add", ["blank", "sum"], ["pattern"]),
+            helper.make_node("ReduceMax", ["window"], ["newest"], axes=[2, 3]),
+            helper.make_node("ReduceMax", ["newest"], ["most"], axes=[1], keepdims=0),  # of each window
+            helper.make_node("Add", ["most", "sum"], ["more"]),
+            helper.make_node("Add", ["blank", "more"], ["pattern"]),
         ]
-        blank = np.zeros(contract.output_shapes["pattern"], np.float32)
+        blank = np.zeros((1, *contract.pattern_shape), np.float32)
         constants = {"shape": np.array([1 << 30, 1 << 20]), "blank": blank}
         path = save_graph(tmp_path / "huge.onnx", nodes, contract, constants, contract.to_metadata())
         with pytest.raises(ModelError, match=r"huge\.onnx: .*allocate") as raised:

@@ -18,7 +18,6 @@ from firmware_bridge.scans.pad_constants import PAD_RANGES
 BROKEN_VALUES = {
     "made_for": {"poisson": [0.5, 0.4]},
     "version": 1,
-    "batch": 0,
     "taps": 0,
     "scale": "10",
     "tap_order": "oldest first",
@@ -149,7 +148,7 @@ POSED = {"takes_poses": "true"}
     [
         *(
             (SMALL | {key: str(most)}, {key: str(most + 1)}, f"1 to {most}")
-            for key, most in {"batch": 1024, "taps": 64, "rows": 64, "cols": 64}.items()
+            for key, most in {"taps": 64, "rows": 64, "cols": 64}.items()
         ),
         (SMALL | {"scale": "256"}, {"scale": "257"}, "1 to 256"),
         ({"rows": "64", "cols": "64", "scale": "16"}, {"scale": "17"}, "patterns of at most 1048576 pixels"),

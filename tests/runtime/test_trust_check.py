@@ -9,7 +9,7 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import FOREIGN_TAXEL, make_trust, make_trusted_contract
 
 from edge.api import Pad
-from edge.inference.contract import ANY_BATCH, scheduled_rows
+from edge.inference.contract import scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.taxel_health import REPEATS
@@ -199,7 +199,7 @@ ELSEWHERE = 10
 
 
 def make_pad(model=None, options=EVERY, **settings):
-    posed = {"batch": ANY_BATCH, "takes_poses": True, "reach_mm": 10.0, "unposed_taps": 4}
+    posed = {"takes_poses": True, "reach_mm": 10.0, "unposed_taps": 4}
     model = model or FakeModel(make_trusted_contract(**posed))
     return Pushed(make_runtime(model, options=options, **settings), taxel=FOREIGN_TAXEL, noise=3)
 
