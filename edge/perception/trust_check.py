@@ -201,8 +201,8 @@ class PatternCheck:
             reason = "beyond"  # than all presses of the training, up to 40 N, but for one in a thousand
         elif not explained:
             reason = "unexplained"
-        elif doubt is not None and not 0 <= doubt <= most_doubt(z_counts):
-            reason = "uncertain"
+        elif doubt is not None and not 0 <= doubt <= MOST_DOUBT * (z_counts / 1e3) ** 0.1:
+            reason = "uncertain"  # light contacts are wrong more often than they state
         elif self.suspected:
             reason = "sensor"
         return TrustVerdict(reason is None, reason, mismatch)
@@ -236,14 +236,6 @@ def _alternates(z: NDArray[np.float32]) -> bool:
     along = change[::2, ::2].sum() + change[1::2, 1::2].sum() - change[::2, 1::2].sum() - change[1::2, ::2].sum()
     # Crossed bars of two pitches reach a share of 0.84 in simulation.
     return float(along) ** 2 > 0.9 * z.size * float(np.vdot(change, change))
-
-
-def most_doubt(z_counts: float) -> float:
-    """Return the largest doubt of a pattern that is believed, by the largest z of its contact.
-
-    Light contacts are wrong more often than they state.
-    """
-    return MOST_DOUBT * (z_counts / 1e3) ** 0.1
 
 
 def _share(log_odds: float) -> float:
