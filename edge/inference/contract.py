@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import ModelError
-from edge.inference.intervals import is_confidence, is_interval_levels, is_number
+from edge.inference.intervals import is_confidence, is_number
 from edge.inference.trust_model import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
@@ -283,8 +283,7 @@ def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
     yield "interval_factor", is_factor, "a positive number, or null for a model without deviations"
     tables = "for each number of taps `doubt`, `error` and `gain`, lists of equal length, `doubt` rising"
     yield "confidence", is_confidence(values["confidence"], values["taps"]), tables
-    is_levels = is_interval_levels(values["interval_levels"])
-    yield "interval_levels", is_levels, "for each percentage a positive number for every region"
+    yield "interval_levels", isinstance(values["interval_levels"], dict), "a map from percentages to factors"
     units = values["counts_per_unit"]
     is_units = isinstance(units, list) and len(units) == 3 and all(_is_from(LEAST_UNIT, unit) for unit in units)
     yield "counts_per_unit", is_units, f"three positive numbers from {LEAST_UNIT:g}, for x, y, z"

@@ -6,7 +6,6 @@ Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
 """
 
 from collections.abc import Iterator, Mapping
-from math import prod
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -38,7 +37,6 @@ _BROKEN: Final = "not a model that onnxruntime can load: damaged, or not an ONNX
 _SPARSE: Final = "has sparse weights, expected plain ones"
 
 _Message = Mapping[int, "_Message | str"]  # number of a field -> the message that it holds, or the reason to refuse it
-_DIMS: Final = 1
 _LOCATION: Final = 14
 _OPERATOR: Final = 4
 _DOMAIN: Final = 7
@@ -80,8 +78,8 @@ def check_plain(content: bytes) -> None:
     """Refuse all files but one plain graph with its weights.
 
     Raises:
-        ModelError: weights in another file, sparse or of more elements than the file can hold; graphs within the
-            graph; an operator that is not one of OPERATORS, or too many; or not the encoding that ONNX has.
+        ModelError: weights in another file, or sparse; graphs within the graph; an operator that is not one of
+            OPERATORS, or too many; or not the encoding that ONNX has.
     """
     waiting: list[tuple[_Message, int, int]] = [(_MODEL, 0, len(content))]
     fields = nodes = 0
@@ -90,7 +88,6 @@ def check_plain(content: bytes) -> None:
         nodes += message is _NODE
         if nodes > MOST_NODES:
             raise ModelError(f"has more than {MOST_NODES} operators, expected a smaller graph")
-        dims: list[int] = []
         for field in _fields(content, start, end):
             fields += 1
             if fields > MOST_FIELDS:
@@ -100,16 +97,10 @@ def check_plain(content: bytes) -> None:
                 raise ModelError(kind)
             if kind is not None and field.wire == _LENGTH:
                 waiting.append((kind, field.start, field.end))
-            if message is _TENSOR:
-                if field.number == _LOCATION and (field.wire != _VARINT or field.value):
-                    raise ModelError(_SIDE_FILE)
-                if field.number == _DIMS:
-                    dims += _dims(content, field)
+            if message is _TENSOR and field.number == _LOCATION and (field.wire != _VARINT or field.value):
+                raise ModelError(_SIDE_FILE)
             if message is _NODE and field.number in (_OPERATOR, _DOMAIN):
                 _check_operator(field.number, content[field.start : field.end])
-        # Four bits are the least that an element takes.
-        if dims and (len(dims) > 64 or prod(dims) > 2 * len(content)):
-            raise ModelError(f"has weights of shape {dims[:8]}, more than its {len(content)} bytes can hold")
 
 
 def _check_operator(field: int, name: bytes) -> None:
@@ -118,15 +109,6 @@ def _check_operator(field: int, name: bytes) -> None:
         raise ModelError(f"has operator {text!r}, expected only those that docs/formats.md lists")
     if field == _DOMAIN and text not in ("", "ai.onnx"):
         raise ModelError(f"has an operator of domain {text!r}, expected ONNX's own alone")
-
-
-def _dims(content: bytes, field: _Field) -> Iterator[int]:
-    if field.wire == _VARINT:
-        yield field.value
-    position = field.start
-    while field.wire == _LENGTH and position < field.end:  # packed
-        value, position = _varint(content, position, field.end, _VARINT_BYTES)
-        yield value
 
 
 def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:

@@ -155,7 +155,8 @@ class PatternCheck:
             if scaled[0, 2].sum() >= 0.85 * scaled[number, 2].sum()
         ]
         for number in forgotten:
-            self._report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")
+            which = "the tap before" if number == 1 else "an earlier tap"
+            self._report("tap_dropped", f"{which} does not belong to this contact, and is forgotten")
         if forgotten:
             slots = window.slots
             tracker.forget([slots[tap] for tap in forgotten] if posed else range(slots[forgotten[0]], sys.maxsize))
@@ -242,10 +243,3 @@ def _share(log_odds: float) -> float:
     if math.isnan(log_odds):
         return 1.0
     return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))  # beyond 30 it is 0 or 1 to ten digits
-
-
-def _which(number: int, *, alone: bool) -> str:
-    if number == 1:
-        return "the tap before does"
-    ordinal = {2: "2nd", 3: "3rd"}.get(number, f"{number}th")  # of six earlier taps at most
-    return f"the {ordinal} tap before does" if alone else f"taps from the {ordinal} before on do"
