@@ -211,12 +211,6 @@ def counted(pad, counts):
 
 
 class TestTaps:
-    def test_taps_of_one_contact_are_kept(self):
-        pad = make_pad()
-        taps = [pad.tap() for _ in range(5)]
-        assert [one.taps_used for one in taps] == [1, 2, 3, 4, 4] and pad.kinds == []
-        assert max(taps[-1].tap_mismatch) < 0.5
-
     def test_a_foreign_tap_is_dropped_with_those_before_it(self):
         pad = make_pad()
         pad.tap()
