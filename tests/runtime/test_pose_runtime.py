@@ -226,6 +226,7 @@ def test_an_earlier_tap_is_not_touched_again_and_in_reach():
     shift_mm = next_shift_mm(np.array([[0.0, 0.0], [-HALF_MM, 0.0]]), 3.4)
     assert shift_mm is not None and np.hypot(shift_mm[0] + HALF_MM, shift_mm[1]) <= 3.4
     assert next_shift_mm(np.zeros((1, 2)), 2.0) is None
+    assert next_shift_mm(np.array([[0.0, 0.0], [5.0, 0.0], [-5.0, 0.0]]), 5.1) is None, "none is in reach of all"
 
 
 def test_a_robot_that_follows_touches_no_place_twice():
