@@ -25,6 +25,21 @@ NoteKind = Literal[
 KINDS: Final[frozenset[str]] = frozenset(get_args(EventKind))
 NOTE_KINDS: Final[frozenset[str]] = frozenset(get_args(NoteKind))
 
+_OF_SENSOR = ("rest_level", "baseline_doubted", "gains_learned", "tap_dropped", "tap_without_pose", "tap_out_of_reach")
+_TEXTS: Final = {
+    "reset": "earlier taps forgotten",
+    "zeroing": "sensor {sensor}: no baseline yet, zeroing since the start",
+    "zeroed": "sensor {sensor} zeroed on demand: {detail}",
+    "in_contact": "zeroing refused: sensor {sensor} is in contact: free the pad, or force it "
+    '(Z, or {{"cmd": "zero", "force": true}})',
+    "given_up": "sensor {sensor}: zeroing given up, the old baseline stays: {detail}",
+    "suspected": "sensor {sensor} is suspected: {detail}",
+    "cleared": "sensor {sensor}: contacts read as they should again",
+    "baseline_cleared": "sensor {sensor}: the baseline is no longer in doubt",
+    **dict.fromkeys(_OF_SENSOR, "sensor {sensor}: {detail}"),
+}
+"""Texts of kinds that say more than their detail."""
+
 
 @dataclass(frozen=True, slots=True)
 class Event:
@@ -50,38 +65,7 @@ class Event:
     @property
     def text(self) -> str:
         """Text of the event in a user's words."""
-        match self.kind:
-            case "reset":
-                return "earlier taps forgotten"
-            case "zeroing":
-                return f"sensor {self.sensor}: no baseline yet, zeroing since the start"
-            case "zeroed":
-                return f"sensor {self.sensor} zeroed on demand: {self.detail}"
-            case "in_contact":
-                remedy = 'free the pad, or force it (Z, or {"cmd": "zero", "force": true})'
-                return f"zeroing refused: sensor {self.sensor} is in contact: {remedy}"
-            case "given_up":
-                return f"sensor {self.sensor}: zeroing given up, the old baseline stays: {self.detail}"
-            case "suspected":
-                causes = (
-                    "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
-                )
-                return f"sensor {self.sensor} is suspected: {self.detail or causes}"
-            case "cleared":
-                return f"sensor {self.sensor}: contacts read as they should again"
-            case "baseline_cleared":
-                return f"sensor {self.sensor}: the baseline is no longer in doubt"
-            case (
-                "rest_level"
-                | "baseline_doubted"
-                | "gains_learned"
-                | "tap_dropped"
-                | "tap_without_pose"
-                | "tap_out_of_reach"
-            ):
-                return f"sensor {self.sensor}: {self.detail}"
-            case _:
-                return self.detail
+        return _TEXTS.get(self.kind, "{detail}").format(sensor=self.sensor, detail=self.detail)
 
     @classmethod
     def of(cls, notice: Notice) -> "Event":

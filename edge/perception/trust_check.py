@@ -33,6 +33,7 @@ MOST_DOUBT: Final = 0.61
 """RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
 
 With the others 3.5 % of simulated contacts less than 30 % off are not believed, and 34 % of those over 50 % off."""
+SUSPECTED: Final = "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
 
 
@@ -218,7 +219,7 @@ class PatternCheck:
             suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
             if suspected != self.suspected:
                 self.suspected = suspected
-                self._report("suspected" if suspected else "cleared")
+                self._report("suspected" if suspected else "cleared", SUSPECTED if suspected else "")
         self._tap, self._strongest = tap, -math.inf
 
 

@@ -97,6 +97,13 @@ EQUIVALENT: dict[str, dict[str, str]] = {
         "_close: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
         "begin_anew: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
     },
+    "taps": {
+        "_choose: earlier.away_mm(other, self._radius_mm) < 0.5 -> earlier.away_mm(other, self._radius_mm) <= 0.5": (
+            "no tap lies half a millimetre away to the last digit"
+        ),
+        "__init__: -1 -> 1": "before a pattern there is no pose, whatever the number of its tap",
+        "_choose: 0 -> 1": "a tap alone has no turn, whatever the step of the schedule",
+    },
     "baseline": {
         "deformation: signed.min() >= -half -> signed.min() > -half": "the slower way gives the same",
         "deformation: signed += half -> signed -= half": "a turn apart, of which the remainder is taken",
