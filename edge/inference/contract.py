@@ -37,7 +37,6 @@ LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
 GAINS_CERTAINTY: Final = "gains_certainty"
-_LATER: Final = ("made_for",)  # keys that models of before lack
 POSE_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg", "error_mm", "error_deg")  # of a row; the newest tap has zeros
 POSE_WIDTH: Final = len(POSE_KEYS)
 LEAST_UNIT: Final = 1e-6  # least divisor in counts, newtons or millimetres, so that float32 holds the quotient
@@ -153,8 +152,8 @@ class Contract:
         if type(version) is not int or version != CONTRACT_VERSION:
             expected = f"expected {CONTRACT_VERSION}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
-        values = {key.name: _value(metadata, key.name) for key in fields(cls) if key.name not in _LATER}
-        values |= {name: _value(metadata, name) for name in _LATER if KEY_PREFIX + name in metadata}
+        metadata = {f"{KEY_PREFIX}made_for": "{}", **metadata}  # which models of before lack
+        values = {key.name: _value(metadata, key.name) for key in fields(cls)}
         _check(values)
         values["counts_per_unit"] = tuple(values["counts_per_unit"])
         values["pad_inputs"] = tuple(map(tuple, values["pad_inputs"]))
@@ -310,7 +309,7 @@ def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
     least_mm = LEAST_UNIT if values["takes_poses"] else 0
     reach = f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0"
     yield "reach_mm", _is_from(least_mm, values["reach_mm"]), reach
-    made_for = values.get("made_for", {})
+    made_for = values["made_for"]
     is_made_for = isinstance(made_for, dict) and all(map(_are_bounds, made_for, made_for.values()))
     yield "made_for", is_made_for, f"a map to two numbers, of names of: {', '.join((*PAD_RANGES, GAINS_CERTAINTY))}"
 
