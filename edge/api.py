@@ -26,7 +26,6 @@ from edge.inference.bundled import (
     find_model,
 )
 from edge.inference.contract import Contract, Model
-from edge.inference.onnx_guard import unfinished_load
 from edge.perception.event import Event, Note
 from edge.perception.result import NextTap, Result, Wrench
 from edge.perception.runtime import Runtime
@@ -89,7 +88,7 @@ __all__ = [
     "TimedPose", "UsageError", "WindowError", "Wrench", "bundled_models", "demo_recording", "devices", "examine",
     "example_recording", "find_model", "infer", "layout_c", "load_baselines", "load_model", "load_sensor_file",
     "open_poses", "open_recording", "open_runtime", "open_sink", "open_source", "paired", "patches", "pump",
-    "save_baselines", "take_baselines", "unfinished_load",
+    "save_baselines", "take_baselines",
 ]
 # fmt: on
 

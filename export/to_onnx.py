@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.test_set import FrozenSet, judge_model, load_frozen_set, mean_error, windows_of
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
-from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
+from edge.inference.contract import CONTRACT_VERSION, TAP_ORDER, Contract
 from edge.inference.intervals import doubt
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.inference.trust_model import Trust
@@ -67,7 +67,6 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> C
         raise CheckpointError(f"the checkpoint's .json has no {error}: train it with this release") from error
     return Contract(
         version=CONTRACT_VERSION,
-        batch=ANY_BATCH,
         taps=net.taps,
         scale=net.scale,
         tap_order=TAP_ORDER,

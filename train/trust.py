@@ -19,6 +19,7 @@ from google.protobuf.message import DecodeError
 from edge.errors import ModelError
 from edge.inference.contract import Contract
 from edge.inference.trust_model import (
+    DAMAGE,
     QUIET_UNITS,
     ForwardModel,
     Trust,
@@ -53,7 +54,7 @@ def load_trust(path: Path, validation: PressSet | None = None) -> Trust:
         fitted = json.loads(path.read_text())
         forward = forward_model(fitted["forward"], len(INPUTS))
         contact, tap = (small_network(fitted[name]) for name in ("contact", "tap"))
-    except (OSError, ValueError, KeyError, TypeError, DecodeError, ModelError) as error:
+    except (OSError, DecodeError, ModelError, *DAMAGE) as error:
         reason = getattr(error, "strerror", None) or error
         raise CheckpointError(f"{path}: {reason}; make it with 'python -m train.trust {path} --data ...'") from error
     if validation is None:

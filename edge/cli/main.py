@@ -19,7 +19,6 @@ from edge.api import (
     ModelError,
     SinkError,
     UsageError,
-    unfinished_load,
 )
 from edge.cli.option_table import COMMAND_LIST, COMMANDS, EXAMPLES, TABLE, Option, runtime_options
 from edge.sinks.registry import check_apart, check_sink
@@ -40,18 +39,10 @@ _EXIT_CODES: Final = {DeviceError: 3, BaselineRefusedError: 3, ModelError: 4, Si
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
-    code = _main(sys.argv[1:] if arguments is None else arguments)
-    if unfinished_load():
-        sys.stderr.flush()
-        os._exit(code)
-    return code
-
-
-def _main(arguments: Sequence[str]) -> int:
     _open_closed_streams()
     try:
         with _guarded_streams():
-            return _command(arguments) or 0
+            return _command(sys.argv[1:] if arguments is None else arguments) or 0
         return 0
     except KeyboardInterrupt:
         return 130  # as a shell's, until a run has begun that ends well

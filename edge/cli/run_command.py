@@ -206,7 +206,7 @@ def run(
         find_model(name)  # first, or a name with a slip would wait for links that are slow to open
         with ThreadPoolExecutor(1) as executor:
             opening = executor.submit(source.open)  # its links open while the model loads
-            model = load_model(name, stop=stop)
+            model = load_model(name)
         with (
             _open_view(options, model.contract, commands) as view,
             contextlib.nullcontext(opening.result()),  # a port of the page that is taken is reported before a lost link

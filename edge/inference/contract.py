@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import ModelError
-from edge.inference.intervals import is_confidence, is_interval_levels, is_number
+from edge.inference.intervals import is_confidence, is_number
 from edge.inference.trust_model import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
@@ -26,18 +26,17 @@ OUTPUT_NAME: Final = "pattern"
 DEVIATION_NAME: Final = "deviation"
 TRACTION_NAME: Final = "traction"
 ANY_BATCH: Final = "any"
-"""Batch of a graph that takes any number of windows in one run; its first dimension bears this name."""
+"""Name of the first dimension of every input and output: a graph takes any number of windows in one run."""
 ANY_TAPS: Final = "taps"
 """Name of the second dimension of window and poses of a graph that takes poses: 1 to K taps in one run."""
 ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
-MOST: Final = MappingProxyType({"batch": 1024, "taps": 64, "scale": 256, "rows": 64, "cols": 64})
+MOST: Final = MappingProxyType({"taps": 64, "scale": 256, "rows": 64, "cols": 64})
 MOST_PIXELS: Final = 1 << 20
 LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
 GAINS_CERTAINTY: Final = "gains_certainty"
-_LATER: Final = ("made_for",)  # keys that models of before lack
 POSE_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg", "error_mm", "error_deg")  # of a row; the newest tap has zeros
 POSE_WIDTH: Final = len(POSE_KEYS)
 LEAST_UNIT: Final = 1e-6  # least divisor in counts, newtons or millimetres, so that float32 holds the quotient
@@ -58,7 +57,6 @@ class Contract:
     """
 
     version: int
-    batch: int | str
     taps: int
     scale: int
     tap_order: str
@@ -89,13 +87,13 @@ class Contract:
 
     @property
     def window_shape(self) -> Shape:
-        """Shape of the window: (batch, 3 taps, rows, cols), a tap's x, y, z side by side.
+        """Shape of the window: (any, 3 taps, rows, cols), a tap's x, y, z side by side.
 
-        With poses it is (batch, taps, 3, rows, cols), of as many taps as there are.
+        With poses it is (any, taps, 3, rows, cols), of as many taps as there are.
         """
         if self.takes_poses:
-            return (self.batch, ANY_TAPS, len(AXES), self.rows, self.cols)
-        return (self.batch, 3 * self.taps, self.rows, self.cols)
+            return (ANY_BATCH, ANY_TAPS, len(AXES), self.rows, self.cols)
+        return (ANY_BATCH, 3 * self.taps, self.rows, self.cols)
 
     @property
     def pattern_shape(self) -> tuple[int, int]:
@@ -123,19 +121,19 @@ class Contract:
         """Shapes of the graph's inputs by name: the window, and the poses and the pad if the model takes them."""
         shapes: dict[str, Shape] = {INPUT_NAME: self.window_shape}
         if self.takes_poses:
-            shapes[POSES_NAME] = (self.batch, ANY_TAPS, POSE_WIDTH)
+            shapes[POSES_NAME] = (ANY_BATCH, ANY_TAPS, POSE_WIDTH)
         if self.pad_width:
-            shapes[PAD_NAME] = (self.batch, self.pad_width)
+            shapes[PAD_NAME] = (ANY_BATCH, self.pad_width)
         return shapes
 
     @property
     def output_shapes(self) -> dict[str, Shape]:
         """Shapes of the graph's outputs by name: the pattern, and its deviation and the traction if there are any."""
-        shapes: dict[str, Shape] = {OUTPUT_NAME: (self.batch, *self.pattern_shape)}
+        shapes: dict[str, Shape] = {OUTPUT_NAME: (ANY_BATCH, *self.pattern_shape)}
         if self.interval_factor is not None:
-            shapes[DEVIATION_NAME] = (self.batch, *self.pattern_shape)
+            shapes[DEVIATION_NAME] = (ANY_BATCH, *self.pattern_shape)
         if self.traction_shape is not None:
-            shapes[TRACTION_NAME] = (self.batch, *self.traction_shape)
+            shapes[TRACTION_NAME] = (ANY_BATCH, *self.traction_shape)
         return shapes
 
     def to_metadata(self) -> dict[str, str]:
@@ -154,8 +152,8 @@ class Contract:
         if type(version) is not int or version != CONTRACT_VERSION:
             expected = f"expected {CONTRACT_VERSION}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
-        values = {key.name: _value(metadata, key.name) for key in fields(cls) if key.name not in _LATER}
-        values |= {name: _value(metadata, name) for name in _LATER if KEY_PREFIX + name in metadata}
+        metadata = {f"{KEY_PREFIX}made_for": "{}", **metadata}  # which models of before lack
+        values = {key.name: _value(metadata, key.name) for key in fields(cls)}
         _check(values)
         values["counts_per_unit"] = tuple(values["counts_per_unit"])
         values["pad_inputs"] = tuple(map(tuple, values["pad_inputs"]))
@@ -270,8 +268,7 @@ def _check(values: Mapping[str, Any]) -> None:
 def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
     """Yield a key, whether its value is lawful, and the expected value; a rule may rely on those before it."""
     for key, most in MOST.items():
-        any_batch = key == "batch" and values[key] == ANY_BATCH
-        yield key, any_batch or _is_whole(values[key], most), f"a whole number from 1 to {most}"
+        yield key, _is_whole(values[key], most), f"a whole number from 1 to {most}"
     taxels = values["rows"] * values["cols"]
     yield "scale", taxels * values["scale"] ** 2 <= MOST_PIXELS, f"patterns of at most {MOST_PIXELS} pixels"
     yield "tap_order", values["tap_order"] == TAP_ORDER, repr(TAP_ORDER)
@@ -285,8 +282,7 @@ def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
     yield "interval_factor", is_factor, "a positive number, or null for a model without deviations"
     tables = "for each number of taps `doubt`, `error` and `gain`, lists of equal length, `doubt` rising"
     yield "confidence", is_confidence(values["confidence"], values["taps"]), tables
-    is_levels = is_interval_levels(values["interval_levels"])
-    yield "interval_levels", is_levels, "for each percentage a positive number for every region"
+    yield "interval_levels", isinstance(values["interval_levels"], dict), "a map from percentages to factors"
     units = values["counts_per_unit"]
     is_units = isinstance(units, list) and len(units) == 3 and all(_is_from(LEAST_UNIT, unit) for unit in units)
     yield "counts_per_unit", is_units, f"three positive numbers from {LEAST_UNIT:g}, for x, y, z"
@@ -313,7 +309,7 @@ def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
     least_mm = LEAST_UNIT if values["takes_poses"] else 0
     reach = f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0"
     yield "reach_mm", _is_from(least_mm, values["reach_mm"]), reach
-    made_for = values.get("made_for", {})
+    made_for = values["made_for"]
     is_made_for = isinstance(made_for, dict) and all(map(_are_bounds, made_for, made_for.values()))
     yield "made_for", is_made_for, f"a map to two numbers, of names of: {', '.join((*PAD_RANGES, GAINS_CERTAINTY))}"
 

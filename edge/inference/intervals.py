@@ -50,24 +50,6 @@ def half_widths_mm(
     return deviations * np.asarray(levels[percent], dtype=np.float32)[region]
 
 
-def is_interval_levels(value: Any) -> bool:
-    """Return whether a value read from a file maps percentages to a factor for each region; it may be empty."""
-    return isinstance(value, dict) and all(_is_percent(key) and _is_factors(row) for key, row in value.items())
-
-
-def _is_percent(key: str) -> bool:
-    try:
-        return 0 < float(key) < 100
-    except ValueError:
-        return False
-
-
-def _is_factors(row: Any) -> bool:
-    if not isinstance(row, list) or len(row) != len(REGIONS):
-        return False
-    return all(type(factor) in (int, float) and 0 < factor <= 1e6 for factor in row)
-
-
 def _grown(masks: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     """Return masks (n, H, W) grown by so many pixels along both axes and all diagonals."""
     grown = masks

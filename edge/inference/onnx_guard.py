@@ -1,20 +1,13 @@
-"""Guards of loading a model: its file is one plain graph with its own weights, of bounded size, and loads in time.
+"""Guard of loading a model: its file is one plain graph with its own weights, of bounded size.
 
 onnxruntime follows a tensor into a side file, and a graph into graphs within it, which may run for ever. The walk
 covers the fields that lead to them and to the operators, skips all else, and refuses what it does not understand.
 Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
-
-While onnxruntime loads a graph, and during its first run, Python handles no signal on the calling thread. So loading
-has a thread of its own, and the calling one only waits, and gives up in time.
 """
 
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, wait
-from math import prod
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 from edge.errors import ModelError
 from firmware_bridge.in_place import read_bounded
@@ -44,7 +37,6 @@ _BROKEN: Final = "not a model that onnxruntime can load: damaged, or not an ONNX
 _SPARSE: Final = "has sparse weights, expected plain ones"
 
 _Message = Mapping[int, "_Message | str"]  # number of a field -> the message that it holds, or the reason to refuse it
-_DIMS: Final = 1
 _LOCATION: Final = 14
 _OPERATOR: Final = 4
 _DOMAIN: Final = 7
@@ -86,8 +78,8 @@ def check_plain(content: bytes) -> None:
     """Refuse all files but one plain graph with its weights.
 
     Raises:
-        ModelError: weights in another file, sparse or of more elements than the file can hold; graphs within the
-            graph; an operator that is not one of OPERATORS, or too many; or not the encoding that ONNX has.
+        ModelError: weights in another file, or sparse; graphs within the graph; an operator that is not one of
+            OPERATORS, or too many; or not the encoding that ONNX has.
     """
     waiting: list[tuple[_Message, int, int]] = [(_MODEL, 0, len(content))]
     fields = nodes = 0
@@ -96,7 +88,6 @@ def check_plain(content: bytes) -> None:
         nodes += message is _NODE
         if nodes > MOST_NODES:
             raise ModelError(f"has more than {MOST_NODES} operators, expected a smaller graph")
-        dims: list[int] = []
         for field in _fields(content, start, end):
             fields += 1
             if fields > MOST_FIELDS:
@@ -106,16 +97,10 @@ def check_plain(content: bytes) -> None:
                 raise ModelError(kind)
             if kind is not None and field.wire == _LENGTH:
                 waiting.append((kind, field.start, field.end))
-            if message is _TENSOR:
-                if field.number == _LOCATION and (field.wire != _VARINT or field.value):
-                    raise ModelError(_SIDE_FILE)
-                if field.number == _DIMS:
-                    dims += _dims(content, field)
+            if message is _TENSOR and field.number == _LOCATION and (field.wire != _VARINT or field.value):
+                raise ModelError(_SIDE_FILE)
             if message is _NODE and field.number in (_OPERATOR, _DOMAIN):
                 _check_operator(field.number, content[field.start : field.end])
-        # Four bits are the least that an element takes.
-        if dims and (len(dims) > 64 or prod(dims) > 2 * len(content)):
-            raise ModelError(f"has weights of shape {dims[:8]}, more than its {len(content)} bytes can hold")
 
 
 def _check_operator(field: int, name: bytes) -> None:
@@ -124,15 +109,6 @@ def _check_operator(field: int, name: bytes) -> None:
         raise ModelError(f"has operator {text!r}, expected only those that docs/formats.md lists")
     if field == _DOMAIN and text not in ("", "ai.onnx"):
         raise ModelError(f"has an operator of domain {text!r}, expected ONNX's own alone")
-
-
-def _dims(content: bytes, field: _Field) -> Iterator[int]:
-    if field.wire == _VARINT:
-        yield field.value
-    position = field.start
-    while field.wire == _LENGTH and position < field.end:  # packed
-        value, position = _varint(content, position, field.end, _VARINT_BYTES)
-        yield value
 
 
 def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:
@@ -168,53 +144,3 @@ def _varint(content: bytes, position: int, end: int, most_bytes: int) -> tuple[i
         if byte < 0x80:
             return value, position
     raise ModelError(_BROKEN)
-
-
-LOAD_LIMIT_S: Final = 60.0  # longest load: a thousand times that of the bundled models
-STOP_S: Final = 0.5
-"""Time that each part of a load may still take after a stop was requested: two in a row come before an end by force."""
-_POLL_S: Final = 0.1
-_THREAD: Final = "edge: loading a model"
-
-Made = TypeVar("Made")
-
-
-def within_limit(
-    work: Callable[[], Made],
-    path: Path,
-    stop: threading.Event | None = None,
-    give_up: Callable[[], object] = lambda: None,
-) -> Made:
-    """Do a part of loading a model on another thread, and return its value or raise its exception.
-
-    Abandoned work goes on until it ends, `give_up` ends it without waiting for that, or the program ends.
-
-    Raises:
-        ModelError: it was not done within LOAD_LIMIT_S, or STOP_S after `stop`.
-    """
-    made = Future[Made]()
-
-    def run() -> None:
-        try:
-            made.set_result(work())
-        except BaseException as error:  # noqa: BLE001 - raised below, on the thread that waits
-            made.set_exception(error)
-
-    threading.Thread(target=run, name=_THREAD, daemon=True).start()
-    until_s, asked_s = time.monotonic() + LOAD_LIMIT_S, None
-    while not wait([made], _POLL_S).done:
-        now_s = time.monotonic()
-        if asked_s is None and stop is not None and stop.is_set():
-            asked_s = now_s
-        if asked_s is not None and now_s > asked_s + STOP_S:
-            give_up()
-            raise ModelError(f"{path}: stopped before it was loaded")
-        if now_s > until_s:
-            give_up()
-            raise ModelError(f"{path}: not loaded within {LOAD_LIMIT_S:g} s: export a smaller graph")
-    return made.result()
-
-
-def unfinished_load() -> bool:
-    """Return whether an abandoned load goes on; `os._exit` must end the program then, or onnxruntime may crash."""
-    return any(thread.name == _THREAD for thread in threading.enumerate())

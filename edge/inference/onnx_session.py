@@ -2,7 +2,6 @@
 
 import os
 import re
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,6 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright
 
 from edge.errors import ModelError, WindowError
 from edge.inference.contract import (
-    ANY_BATCH,
     DEVIATION_NAME,
     INPUT_NAME,
     OUTPUT_NAME,
@@ -27,7 +25,7 @@ from edge.inference.contract import (
     Contract,
     scheduled_rows,
 )
-from edge.inference.onnx_guard import read_model, within_limit
+from edge.inference.onnx_guard import read_model
 from firmware_bridge.errors import harmless
 
 LOG_FATAL_ONLY: Final = 4
@@ -36,8 +34,6 @@ _PLACE: Final = re.compile(
     r"/\S+\.(?:cc|cpp|h):\d+ [\w:~<>]+(?: [\w:~<>&*]+)*\([^()]*(?:\([^()]*\)[^()]*)*\)(?: const)? "
 )
 """Pattern of a function's file, line and signature."""
-_NEWER: Final = re.compile(r"IR version: \d+|Opset \d+(?= is under development)")
-"""Pattern of the version in the messages on a file of a later format or operator set."""
 ORT_ERRORS: Final = (
     ort_errors.EPFail,
     ort_errors.Fail,
@@ -66,27 +62,19 @@ class ModelSession:
         traction: of the last run, (3, h, w) or (n, 3, h, w) float32 in [kPa], as `deviation`.
     """
 
-    def __init__(
-        self, path: Path, threads: int = 1, stop: threading.Event | None = None, *, taps: int | None = None
-    ) -> None:
-        """Load, check and warm up; `threads` share the work of one run, and `stop` ends the loading early.
+    def __init__(self, path: Path, threads: int = 1, *, taps: int | None = None) -> None:
+        """Load, check and warm up; `threads` share the work of one run.
 
         `taps` are the most that are given to a model that takes more, with poses; the name then states them.
 
         Raises:
-            ModelError: the file is no model that is allowed, its graph does not keep its contract, or loading takes
-                too long.
+            ModelError: the file is no model that is allowed, or its graph does not keep its contract.
         """
         self._path = path
         self.name = harmless(path.stem, kept="")
-        self._session = load_session(path, threads, stop)
+        self._session = load_session(path, threads)
         try:
             self.contract = Contract.from_metadata(self._session.get_modelmeta().custom_metadata_map)
-            if self.contract.batch not in (1, ANY_BATCH):
-                raise ModelError(
-                    f"contract key 'batch' is {self.contract.batch}, but here the number of windows changes from run "
-                    "to run: export it again"
-                )
             _check_tensors("input", self._session.get_inputs(), self.contract.input_shapes)
             _check_tensors("output", self._session.get_outputs(), self.contract.output_shapes)
         except ModelError as error:
@@ -104,11 +92,9 @@ class ModelSession:
         self.traction: NDArray[np.float32] | None = None
         self._shape = (self.contract.taps, 3, self.contract.rows, self.contract.cols)
         self._unknown_pad = self.contract.pad_row(None)
-        within_limit(self._warm_up, path, stop, give_up=self._end_run)
-
-    def __repr__(self) -> str:
-        taps, shape = self.contract.taps, self.contract.pattern_shape
-        return f"<ModelSession {self.name}: {taps} tap{'s' * (taps > 1)} to {shape} {self.contract.output_unit}>"
+        for taps in sorted({1 if self.contract.takes_poses else self.contract.taps, self.contract.taps}):
+            for _ in range(10):  # the first runs are slower
+                self.run(np.zeros((taps, *self._shape[1:]), dtype=np.float32))
 
     def run(
         self,
@@ -149,7 +135,7 @@ class ModelSession:
     ) -> NDArray[np.float32]:
         """Infer the patterns (n, H, W) of several windows, of different sensors, in one call; see `run`.
 
-        A graph of one window a run is called once for each. With poses, windows may have different numbers of taps.
+        With poses, windows may have different numbers of taps.
         """
         for window in windows:
             self._check_window(window)
@@ -175,7 +161,11 @@ class ModelSession:
             feeds[INPUT_NAME] = np.array(windows).reshape(len(windows), -1, *self._shape[2:])
         if self._unknown_pad.size:
             feeds[PAD_NAME] = np.array(pads)
-        outputs = dict(zip(self._names, self._outputs_of(feeds), strict=True))
+        run: Any = self._session.run
+        try:
+            outputs = dict(zip(self._names, run(self._names, feeds, self._options), strict=True))
+        except ORT_ERRORS as error:
+            raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
         pattern = outputs[OUTPUT_NAME]
         deviation, traction = outputs.get(DEVIATION_NAME), outputs.get(TRACTION_NAME)
         if not np.isfinite(pattern).all():
@@ -187,19 +177,6 @@ class ModelSession:
             raise ModelError(f"model '{self.name}' gave a deviation that is not finite and above zero: export it again")
         self.deviation, self.traction = deviation, traction
         return pattern
-
-    def _outputs_of(self, feeds: Mapping[str, NDArray[np.float32]]) -> list[NDArray[np.float32]]:
-        """Return the outputs of the graph for inputs by name, one after the other where it takes one window a run."""
-        run: Any = self._session.run
-        count = len(feeds[INPUT_NAME])
-        try:
-            if count == 1 or self.contract.batch == ANY_BATCH:
-                return run(self._names, feeds, self._options)
-            single = ({name: values[index : index + 1] for name, values in feeds.items()} for index in range(count))
-            parts = [run(self._names, feed, self._options) for feed in single]
-        except ORT_ERRORS as error:
-            raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
-        return list(map(np.concatenate, zip(*parts, strict=True)))
 
     def _check_window(self, window: NDArray[np.float32]) -> None:
         shape, expected = window.shape, str(self._shape)
@@ -217,14 +194,6 @@ class ModelSession:
         rows = scheduled_rows(len(window), self.contract.angle_step_deg)
         rows[~window.any(axis=(1, 2, 3))] = 0
         return rows
-
-    def _warm_up(self) -> None:
-        for taps in sorted({1 if self.contract.takes_poses else self.contract.taps, self.contract.taps}):
-            for _ in range(10):
-                self.run(np.zeros((taps, *self._shape[1:]), dtype=np.float32))
-
-    def _end_run(self) -> None:
-        self._options.terminate = True  # checked before each operator
 
 
 def _present(window: NDArray[np.float32]) -> int:
@@ -263,41 +232,26 @@ def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
     return options
 
 
-def load_session(path: Path, threads: int = 1, stop: threading.Event | None = None) -> onnxruntime.InferenceSession:
+def load_session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
     """Load any ONNX file with the runtime's session options, without looking for a contract.
 
     Raises:
-        ModelError: the file is missing, not a model, not one plain graph with its weights, or loading takes too long.
+        ModelError: the file is missing, not a model, or not one plain graph with its weights.
     """
     content = read_model(path)
-    options = session_options(threads)
-
-    def load() -> onnxruntime.InferenceSession:
+    try:
         # The fallback would try the same again, and print on stdout, where records go. In a stranger's file the folding
         # of constants can last hours.
         return onnxruntime.InferenceSession(
             content,
-            options,
+            session_options(threads),
             providers=["CPUExecutionProvider"],
             enable_fallback=0,
             disabled_optimizers=["ConstantFolding"],
         )
-
-    try:
-        return within_limit(load, path, stop)
     except ORT_ERRORS as error:
-        raise ModelError(f"{path}: not a model that onnxruntime can load: {_load_reason(error)}") from error
-
-
-def _load_reason(error: Exception) -> str:
-    reason = _reason(error)
-    made = _NEWER.search(reason)
-    if made is None:
-        return reason
-    return (
-        f"it is of a newer ONNX, {' '.join(made[0].split())}, than onnxruntime {onnxruntime.__version__} reads: export "
-        "it again with python -m export.to_onnx, or install a newer onnxruntime"
-    )
+        reason = f"{_reason(error)}: export it again, or install a newer onnxruntime"
+        raise ModelError(f"{path}: not a model that onnxruntime can load: {reason}") from error
 
 
 def _reason(error: Exception) -> str:

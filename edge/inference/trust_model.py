@@ -7,7 +7,6 @@ made by train.trust, in network units, and travels in a model's contract.
 """
 
 import base64
-import binascii
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -19,31 +18,23 @@ from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import AXES
 
-MOST_INPUTS: Final = 1024
-MOST_LAYERS: Final = 4
-MOST_UNITS: Final = 256
-
 
 class SmallNetwork:
     """Layers of weights (outputs, inputs) and offsets (outputs,), rectified, from a row of features to one number.
 
     Raises:
-        ValueError: layers that do not follow each other, are too large, or do not end in one number.
+        ValueError: layers that do not follow each other, or do not end in one number.
     """
 
     def __init__(self, layers: Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]) -> None:
-        if not 1 <= len(layers) <= MOST_LAYERS:
-            raise ValueError(f"{len(layers)} layers, expected 1 to {MOST_LAYERS}")
         width = layers[0][0].shape[-1]
-        if not 1 <= width <= MOST_INPUTS:
-            raise ValueError(f"{width} inputs, expected 1 to {MOST_INPUTS}")
         self.inputs: Final = width
         self._layers = tuple(
             (weights.T.astype(np.float32, order="C"), offsets.astype(np.float32)) for weights, offsets in layers
         )
         for weights, offsets in self._layers:
-            if weights.ndim != 2 or weights.shape != (width, len(offsets)) or len(offsets) > MOST_UNITS:
-                raise ValueError(f"a layer of {weights.shape[::-1]} after {width} units, of at most {MOST_UNITS}")
+            if weights.shape != (width, *offsets.shape) or offsets.ndim != 1:
+                raise ValueError(f"a layer of {weights.shape[::-1]} after {width} units")
             width = len(offsets)
         if width != 1:
             raise ValueError(f"{width} outputs, expected 1")
@@ -64,15 +55,12 @@ class SmallNetwork:
 
 
 def small_network(value: Any) -> SmallNetwork:
-    """Return the network of a value that `SmallNetwork.to_json` has made.
+    """Return the network of a value that `SmallNetwork.to_json` has made; raises one of DAMAGE if it is none."""
+    return SmallNetwork([(unpacked(layer["weights"]), unpacked(layer["offsets"])) for layer in value])
 
-    Raises:
-        ValueError: it is none.
-    """
-    try:
-        return SmallNetwork([(unpacked(layer["weights"]), unpacked(layer["offsets"])) for layer in value])
-    except (TypeError, KeyError, IndexError) as error:
-        raise ValueError(f"no list of layers ({error})") from error
+
+DAMAGE: Final = (TypeError, KeyError, IndexError, ValueError, OverflowError, AttributeError)
+"""Errors of reading what is no packed array, network or model."""
 
 
 def packed(values: NDArray[np.floating]) -> dict[str, Any]:
@@ -82,19 +70,10 @@ def packed(values: NDArray[np.floating]) -> dict[str, Any]:
 
 
 def unpacked(value: Any) -> NDArray[np.float32]:
-    """Return the array of a value that `packed` has made.
-
-    Raises:
-        ValueError: the numbers are not as many as the shape needs, or not finite.
-    """
-    try:
-        shape = [int(length) for length in value["shape"]]
-        if not all(0 < length <= 1 << 16 for length in shape):
-            raise ValueError(f"shape is {shape}")
-        content = base64.b64decode(value["f2"], validate=True)
-    except (TypeError, KeyError, OverflowError, binascii.Error) as error:
-        raise ValueError(f"no packed array ({error})") from error
-    if len(content) != 2 * math.prod(shape):
+    """Return the array of a value that `packed` has made; raises one of DAMAGE if it is none."""
+    shape = [int(length) for length in value["shape"]]
+    content = base64.b64decode(value["f2"], validate=True)
+    if not all(length > 0 for length in shape) or len(content) != 2 * math.prod(shape):
         raise ValueError(f"{len(content)} bytes for an array of {shape}")
     values = np.frombuffer(content, dtype="<f2").astype(np.float32).reshape(shape)
     if not np.isfinite(values).all():
@@ -170,25 +149,21 @@ class ForwardModel:
 def forward_model(value: Any, constants: int) -> ForwardModel:
     """Return the forward model of a value that `ForwardModel.to_json` has made, for a model that takes `constants`.
 
-    Raises:
-        ValueError: it is none, or of other constants.
+    Raises one of DAMAGE if it is none, or of other constants.
     """
-    names = [field.name for field in fields(ForwardModel)]
-    if not isinstance(value, dict) or set(value) != set(names):
-        raise ValueError(f"expected {', '.join(names)}")
-    arrays = {name: unpacked(value[name]) for name in names}
-    readings = arrays["operator"].shape[1] if arrays["operator"].ndim > 1 else 0
+    arrays = {name: unpacked(packed_array) for name, packed_array in value.items()}
+    model = ForwardModel(**arrays)
     expected = {
-        "operator": (1 + constants, readings, FEATURES),
+        "operator": (1 + constants, model.operator.shape[1], FEATURES),
         "noise": (len(AXES),),
         "model_error": (len(AXES),),
     }
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} is {arrays[name].shape}, expected {shape}")
-    if not ((arrays["noise"] > 0).all() and (arrays["model_error"] > 0).all()):
+    if not ((model.noise > 0).all() and (model.model_error > 0).all()):
         raise ValueError("noise and model_error, expected above 0")
-    return ForwardModel(**arrays)
+    return model
 
 
 def features(pattern: NDArray[np.float32], traction: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -237,15 +212,8 @@ class FamiliarityCheck:
 
 
 def check_of(value: Any) -> FamiliarityCheck:
-    """Return the check of a value that `FamiliarityCheck.to_json` has made.
-
-    Raises:
-        ValueError: it is none.
-    """
-    if not isinstance(value, dict) or set(value) != {"layers", "limit"}:
-        raise ValueError("no check: expected layers and a limit")
-    limit = value["limit"]
-    if not isinstance(limit, float) or not math.isfinite(limit):
+    """Return the check of a value that `FamiliarityCheck.to_json` has made; raises one of DAMAGE if it is none."""
+    if type(limit := value["limit"]) is not float or not math.isfinite(limit):
         raise ValueError(f"limit is {limit!r}, expected a number")
     return FamiliarityCheck(small_network(value["layers"]), limit)
 
@@ -317,13 +285,13 @@ def trust_of(value: Any, constants: int) -> Trust | None:
     """
     if value == {}:
         return None
-    if not isinstance(value, dict) or set(value) != {"forward", "contact", "tap"}:
-        raise ValueError("expected forward, contact, tap, or nothing")
-    forward = forward_model(value["forward"], constants)
-    contact, tap = check_of(value["contact"]), check_of(value["tap"])
+    try:
+        forward, contact, tap = (value[part] for part in ("forward", "contact", "tap"))
+        forward, contact, tap = forward_model(forward, constants), check_of(contact), check_of(tap)
+    except DAMAGE as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from error
     readings = forward.operator.shape[1]
-    expected = {"contact": (contact, readings + 1 + 2 * constants + 1), "tap": (tap, pair_width(readings))}
-    for name, (check, inputs) in expected.items():
+    for check, inputs in ((contact, readings + 1 + 2 * constants + 1), (tap, pair_width(readings))):
         if check.network.inputs != inputs:
-            raise ValueError(f"{name} takes {check.network.inputs} features, expected {inputs}")
+            raise ValueError(f"a network takes {check.network.inputs} features, expected {inputs}")
     return Trust(forward, contact, tap)

@@ -1,7 +1,7 @@
 """Stage that learns the gains of a sensor's channels from its ordinary contacts: slow, bounded, drawn to their start.
 
 Nothing is computed while a pattern is made but a comparison: the strongest scan of a tap is kept, and is learned from
-once the pad is free again, or after HELD_SCANS.
+once the pad is free again.
 
 The model is the distribution of contacts on simulated pads (`contacts.npz`): a mixture of normal distributions of a
 contact's 48 readings over the RMS of its z, whose means are linear in what differs from pad to pad. What explains a
@@ -35,7 +35,6 @@ REMEMBERED: Final = 64
 """Newest distinct contacts, of which a further one must differ: always the same contact teaches once."""
 BOUND: Final = 0.25  # largest deviation of a gain from 1
 _FREEDOM: Final = 5.0  # degrees of freedom of Student's t, which weighs down contacts that no component explains well
-HELD_SCANS: Final = 200
 CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which measured gains are found to be another sensor's
 _OPEN: Final = 1 / np.sqrt(3)  # prior deviation of a constant over half of its range: uniform within it
 _Z: Final = slice(2 * TAXELS, 3 * TAXELS)
@@ -339,28 +338,24 @@ class Learn:
         self._by_hand = Pad() if measured is None else replace(measured, gains=None, gain_half_widths=None)
         self._strongest = np.zeros(0, dtype=np.float32)
         self._force_counts = 0.0
-        self._seen = 0
         self._learned: Pad | None = None
 
-    def __call__(self, step: Step, made: Estimate, counts: NDArray[np.float32], dead: NDArray[np.bool_]) -> bool:
-        """Take a contact's pattern and its readings (3, rows, cols); return whether another pad is in use since.
+    def __call__(self, step: Step, made: Estimate, counts: NDArray[np.float32]) -> None:
+        """Take a contact's pattern and its readings (3, rows, cols).
 
         A pattern that is not to be trusted teaches nothing, and nor does what came before it in the same contact.
         """
+        force_counts = step.force_counts or 0.0
         if made.trusted is False:
             self.waiting, self._force_counts = False, 0.0
-            return False
-        self._seen += 1
-        force_counts = step.force_counts or 0.0
-        if force_counts > self._force_counts:
+        elif force_counts > self._force_counts:
             self._strongest, self._force_counts = counts, force_counts
             self.waiting = True
-        return self._seen >= HELD_SCANS and self.learn(dead)
 
     def learn(self, dead: NDArray[np.bool_]) -> bool:
         """Learn from the contact that waits; return whether another pad is in use since."""
         learner, check = self._learner, self._check
-        self.waiting, self._force_counts, self._seen = False, 0.0, 0
+        self.waiting, self._force_counts = False, 0.0
         learned = learner.learn(self._strongest, dead)
         enough = self._from_file and learner.contacts >= CONTRADICTED_CONTACTS
         # A sensor's own gains reached 4.4 at most in a thousand contacts, on 48 simulated sensors (docs/decisions.md).

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from edge.perception.result import Result
 from edge.validation import check_positive
 
 PatchEventKind = Literal["begin", "move", "slip", "end"]
+SCANS: Final = 3  # results in a row by which a contact begins or ends
+REACH_MM: Final = 4.0  # way of a contact from one result to the next; further away it is another one
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +155,7 @@ class PatchEvent(NamedTuple):
 class PatchEvents:
     """Follower of one sensor's contacts from result to result.
 
-    A contact begins once it was there for `scans` results in a row, and ends once it was missing for as many; it moves
+    A contact begins once it was there for SCANS results in a row, and ends once it was missing for as many; it moves
     by `move_mm` from where it was when that was last reported; it slips where its shear over its normal force reaches
     `slip_ratio`, and again only after it has fallen to four fifths of it. Patterns that are not believed count for
     nothing.
@@ -162,20 +164,10 @@ class PatchEvents:
         UsageError: a number is not positive.
     """
 
-    def __init__(
-        self,
-        contract: Contract,
-        *,
-        slip_ratio: float = 0.5,
-        move_mm: float = 1.0,
-        reach_mm: float = 4.0,
-        scans: int = 3,
-    ) -> None:
-        limits = {"slip_ratio": slip_ratio, "move_mm": move_mm, "reach_mm": reach_mm, "scans": scans}
-        for name, limit in limits.items():  # one that is NaN would never be reached
-            check_positive(name, limit)
+    def __init__(self, contract: Contract, *, slip_ratio: float = 0.5, move_mm: float = 1.0) -> None:
+        check_positive("slip_ratio", slip_ratio)  # one that is NaN would never be reached
+        check_positive("move_mm", move_mm)
         self._contract, self._slip_ratio, self._move_mm = contract, slip_ratio, move_mm
-        self._reach_mm, self._scans = reach_mm, scans
         self._followed: list[_Followed] = []
         self._begun = 0
 
@@ -187,7 +179,7 @@ class PatchEvents:
         events: list[PatchEvent] = []
         for contact in self._followed:
             near = min(free, key=contact.distance_mm, default=None)
-            if near is None or contact.distance_mm(near) > self._reach_mm:
+            if near is None or contact.distance_mm(near) > REACH_MM:
                 contact.missing += 1
                 continue
             free.remove(near)
@@ -200,10 +192,10 @@ class PatchEvents:
         return events
 
     def _is_over(self, contact: "_Followed") -> bool:
-        return contact.missing >= (self._scans if contact.number else 1)
+        return contact.missing >= (SCANS if contact.number else 1)
 
     def _changes(self, contact: "_Followed") -> Iterator[PatchEvent]:
-        if not contact.number and contact.seen >= self._scans:
+        if not contact.number and contact.seen >= SCANS:
             self._begun += 1
             contact.number, contact.reported_mm = self._begun, contact.patch.centre_mm
             yield PatchEvent("begin", contact.number, contact.patch)

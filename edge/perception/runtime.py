@@ -20,8 +20,7 @@ from edge.perception.event import OLD_NS, UNCHECKED, Event, EventKind, age_notes
 from edge.perception.gain_learning import ContactModel, Learn
 from edge.perception.pattern_description import Describe
 from edge.perception.result import Estimate, LastPattern, Result, Step, Window
-from edge.perception.tap_tracker import TapTracker
-from edge.perception.taps import Taps
+from edge.perception.taps import Taps, TapTracker
 from edge.perception.taxel_health import Health, TaxelEstimator
 from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.perception.zeroing import BaselineDoubt, Zeroing
@@ -63,7 +62,7 @@ class Sensor:
         self._name = name
         self._received_ns: int | None = None
         self._check, self._options = check, options
-        self.tracker = TapTracker(contract.taps, options, (geometry.rows, geometry.cols))
+        self.tracker = TapTracker(contract.taps, options)
         self._health = Health((geometry.rows, geometry.cols), mounting, runtime.estimator)
         notes = notes_on_missing(name, runtime.mountings, runtime.baselines)
         self._zeroing = Zeroing(self.tracker, self._health, mounting, self.report, runtime.unix_time_s, notes)
@@ -114,7 +113,7 @@ class Sensor:
         if self._options.follow_drift:
             self._zeroing.follow_drift(step)
         if not step.contact and self.learn is not None and self.learn.waiting and self.learn.learn(self._health.dead):
-            self.last = None
+            self.last = None  # it was made with other gains
         if step.doubted:
             step.notes = (*step.notes, *self._doubt.notes)
         elif step.contact and self._check is None:
@@ -153,10 +152,9 @@ class Sensor:
                 due.tap, newest, made.pattern, about[0] if about else None, made.traction, self._health.most_repeats
             )
         self._describe(made, due.tap, newest, about)
-        if self._taps.advice is not None:
-            self._taps.advice.see(step, due.tap)
-        if self.learn is not None and self.learn(step, made, due.counts[0], self._health.dead):
-            self.last = None  # it was made with other gains
+        self._taps.see(due.tap, step.force_counts or 0.0, None if made.trusted is False else step.pose)
+        if self.learn is not None:
+            self.learn(step, made, due.counts[0])
 
     def zero_again(self, *, force: bool) -> None:
         """Take a new baseline from the next scans, with an event for the outcome; `force` also in contact."""
@@ -239,10 +237,7 @@ class Runtime:
         self._sensors: dict[str, Sensor] = {}
         self._events: list[Callable[[int], Event]] = []
         self._tracks: dict[str | None, PoseTrack] = {}
-
-    def __repr__(self) -> str:
-        sensors = ", ".join(self._sensors) or "none so far"
-        return f"<Runtime of {self.model.name}, {self.source}, sensors: {sensors}>"
+        self._scan_shape = geometry.scan_shape
 
     @property
     def expected(self) -> frozenset[str]:
@@ -309,8 +304,8 @@ class Runtime:
             WindowError: the scan is not of this sensor geometry.
         """
         name = scan.sensor
-        if scan.counts.shape != self.geometry.scan_shape:
-            raise WindowError(f"scan has shape {scan.counts.shape}, expected {self.geometry.scan_shape}")
+        if scan.counts.shape != self._scan_shape:
+            raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
         sensor = self._sensors.get(name)
         if sensor is None:
             sensor = self._sensors[name] = Sensor(name, scan.time_ns, self)

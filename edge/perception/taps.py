@@ -1,7 +1,14 @@
-"""Stage that follows the taps of one sensor: the window of a due pattern, its poses, and where to touch next."""
+"""Taps of one sensor: contact, the window of a due pattern with its poses, and where to touch next.
 
+Contact has two thresholds on the summed z, so that noise around one of them cannot split a tap. While a tap goes on
+the window holds its current frame, not its peak, so that a robot gets a pattern from the first scan of a tap. Earlier
+taps are remembered by their peaks.
+"""
+
+import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
 from math import cos, hypot, radians, sin, sqrt
 from typing import Final
 
@@ -12,11 +19,98 @@ from edge.inference.contract import Contract, pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import EventKind, Report
 from edge.perception.result import NextTap, Step, Window
-from edge.perception.tap_tracker import TapTracker
-from edge.perception.taxel_health import Health
-from edge.perception.trust_check import REPEATS
+from edge.perception.taxel_health import REPEATS, Health
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack
+
+MIN_TAP_SCANS: Final = 2
+"""Fewest scans of a tap. A touch in a single scan may be a flipped bit; it is reported, but not remembered as a tap."""
+
+
+@dataclass(eq=False, slots=True)
+class TapPeak:
+    """Peak of a tap: the tap's number, when its readings (3, rows, cols) were taken, in [ns], and its pose if known."""
+
+    tap: int
+    time_ns: int
+    readings: NDArray[np.float32]
+    pose: PadPose | None = None
+
+
+class TapTracker:
+    """Tracker of the taps of one sensor.
+
+    Attributes:
+        contact: True while a tap goes on.
+        tap: number of the tap, from 0; without contact that of the last one.
+        newest: (3, rows, cols), newest readings in contact.
+        peaks: of the earlier taps, newest first: one fewer than a window has taps.
+    """
+
+    newest: NDArray[np.float32]
+
+    def __init__(self, taps: int, options: RuntimeOptions) -> None:
+        """Start without contact, for windows of K taps."""
+        self._earlier = taps - 1
+        self._on_counts = options.contact_on_counts
+        self._off_counts = options.contact_off_counts
+        self._idle_reset_ns = options.idle_reset_s * 1e9
+        self._peak: TapPeak | None = None
+        self.contact = False
+        self.tap = -1
+        self._last_contact_ns = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every tap. A tap in progress continues as the first one, with a new number."""
+        self.tap += self.contact
+        self.peaks: tuple[TapPeak, ...] = ()
+        self._tap_scans = 0
+        self._peak_counts = -math.inf
+
+    def forget(self, slots: Container[int]) -> None:
+        """Forget the earlier taps at these places of the window; those before them move up."""
+        self.peaks = tuple(peak for slot, peak in enumerate(self.peaks, 1) if slot not in slots)
+
+    def push(
+        self, readings: NDArray[np.float32], z_counts: float, time_ns: int, taken_ns: int, *, doubted: bool = False
+    ) -> None:
+        """Take the zeroed counts (3, rows, cols) of a scan with their summed z, when it arrived and was taken, in [ns].
+
+        The idle time is measured between scans, from the last one in contact. Time that runs backwards counts as no
+        time; a gap within a tap does not end the tap. A scan that is doubted, by `BaselineDoubt` of zeroing.py, is no
+        contact, whatever its z: this ends a tap where a pad rests.
+        """
+        if self.contact:
+            self.contact = z_counts >= self._off_counts and not doubted
+            if not self.contact:
+                self._release()
+        elif z_counts >= self._on_counts and not doubted:
+            self._forget_if_idle(time_ns)
+            self.contact = True
+            self.tap += 1
+
+        if self.contact:
+            self._last_contact_ns = time_ns
+            self._tap_scans += 1
+            self.newest = readings.copy()
+            if z_counts > self._peak_counts:
+                self._peak_counts = z_counts
+                self._peak = TapPeak(self.tap, taken_ns, self.newest)
+        else:
+            self._forget_if_idle(time_ns)
+
+    def _release(self) -> None:
+        if self._tap_scans >= MIN_TAP_SCANS and self._peak is not None:
+            self.peaks = (self._peak, *self.peaks)[: self._earlier]
+        self._tap_scans = 0
+        self._peak_counts = -math.inf
+
+    def _forget_if_idle(self, time_ns: int) -> None:
+        self._last_contact_ns = min(self._last_contact_ns, time_ns)
+        if time_ns - self._last_contact_ns > self._idle_reset_ns:
+            self.reset()
+
 
 _HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
 """Four taps half a pitch apart read what lies between the taxels. A search for the place of the largest expected gain
@@ -24,52 +118,13 @@ was worth 0.41 dB over such places at two taps and 0.08 dB at four, so it is not
 _SHIFTS_MM: Final = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]) * _HALF_PITCH_MM
 
 
-class TapAdvice:
-    """Proposal for one sensor: made once, when a tap ends, and kept until the next one begins."""
-
-    def __init__(self, reach_mm: float, taps: int) -> None:
-        self._reach_mm, self._taps = reach_mm, taps
-        self._strongest: Step | None = None
-        self._tap = -1
-        self._proposed: NextTap | None = None
-
-    def see(self, made: Step, tap: int) -> None:
-        """Take a step with a pattern: the strongest one of a tap, by its number, counts."""
-        before = self._strongest
-        if tap != self._tap:  # also after a reset within a tap, which goes on with another number
-            self._tap, before = tap, None
-        if before is None or (made.force_counts or 0.0) >= (before.force_counts or 0.0):
-            self._strongest = made
-
-    def proposal(self, tap: TapTracker) -> NextTap | None:
-        """Return where to touch next; None during a tap, and where nothing can be proposed or the tap is forgotten."""
-        if tap.contact or not tap.peaks or tap.peaks[0].tap != self._tap:
-            self._proposed = None
-            if not tap.contact:
-                self._strongest = None
-            return None
-        if (made := self._strongest) is not None:
-            self._strongest = None
-            self._proposed = self._propose(made)
-        return self._proposed
-
-    def _propose(self, made: Step) -> NextTap | None:
-        estimate = made.estimate
-        # Without a pose the next tap could not be placed.
-        if made.pose is None or estimate is None or estimate.poses is None:
-            return None
-        if estimate.trusted is False or estimate.taps_used >= self._taps:
-            return None
-        shift_mm = next_shift_mm(estimate.poses[:, :2], self._reach_mm)
-        return None if shift_mm is None else NextTap(*shift_mm, 0.0, _reached(made.pose, *shift_mm))
-
-
 def next_shift_mm(places_mm: NDArray[np.floating], reach_mm: float) -> tuple[float, float] | None:
     """Return the shift dx, dy in [mm] from the newest tap, of half a pitch along x, y or both, to touch next.
 
-    Places (K, 2) of the taps so far are in the newest one's axes, and the next one must not be further than the reach
-    from any of them; None where each place was touched or is out of reach.
+    Places (K, 2) of the taps so far are in the newest one's axes. The next one must not be further than the reach from
+    any of them that is itself in reach; None where each place was touched or is out of reach.
     """
+    places_mm = places_mm[np.hypot(*places_mm.T) <= reach_mm]
     distances_mm = np.hypot(*(_SHIFTS_MM[:, None] - places_mm).transpose(2, 0, 1))
     free = (distances_mm > _HALF_PITCH_MM / 2).all(axis=1) & (distances_mm <= reach_mm).all(axis=1)
     if not free.any():
@@ -96,24 +151,22 @@ NO_TAP = -1  # number of a window that is no tap: readings in doubt, to be looke
 
 
 class Taps:
-    """Stage: contact, the window of taps, their poses, and where to touch next.
-
-    Attributes:
-        advice: proposes where to touch next; None for models that take no poses.
-    """
+    """Stage: contact, the window of taps, their poses, and where to touch next."""
 
     def __init__(
         self, tracker: TapTracker, health: Health, contract: Contract, options: RuntimeOptions, report: Report
     ) -> None:
         self._tracker, self._health = tracker, health
         self._contract, self._report = contract, report
+        self._takes_poses = contract.takes_poses
         self._most = contract.taps if options.taps is None else options.taps
         self._scheduled = options.taps or contract.unposed_taps
         self._on_counts = options.contact_on_counts
         # Root mean square of the taxels' distance from the middle of the pad.
         self._radius_mm = contract.pitch_mm * sqrt((contract.rows**2 + contract.cols**2 - 2) / 12)
         self._reported: deque[int] = deque(maxlen=64)  # newest taps that were left out; no window has as many
-        self.advice = TapAdvice(contract.reach_mm, self._most) if contract.takes_poses else None
+        self._strongest: tuple[int, float, PadPose | None] = -1, 0.0, None  # pattern: its tap, its summed z, its pose
+        self._proposed: tuple[tuple[TapPeak, ...], NextTap | None] = (), None  # for which taps, and what
 
     def __call__(self, step: Step, track: PoseTrack | None) -> None:
         """Take a step with readings; `track` has the poses of its pad, None if there are none."""
@@ -121,33 +174,43 @@ class Taps:
         if readings is None or z_counts is None:
             return
         tap = self._tracker
-        tap.push(readings, scan.time_ns, z_counts, scan.on_bus_ns, doubted=step.doubted)
+        tap.push(readings, z_counts, scan.time_ns, scan.on_bus_ns, doubted=step.doubted)
         if track is not None:  # a pose may come later than its scan, and a track is short
             for peak in tap.peaks:
                 peak.pose = peak.pose or track.at(peak.time_ns)
-        step.state, step.contact = "idle", tap.contact
         if tap.contact:
-            step.state, step.due = "contact", self._window(step, tap, scheduled=track is None)
-        elif step.doubted:
-            step.state, step.contact = "baseline_in_doubt", None
+            step.state, step.contact, step.due = "contact", True, self._window(step, tap, scheduled=track is None)
+        elif not step.doubted:
+            step.state, step.contact = "idle", False
+            if tap.peaks and self._takes_poses:
+                step.next_tap = self._propose(tap.peaks)
+        else:
+            step.state = "baseline_in_doubt"
             if z_counts >= self._on_counts:  # to be looked at, and made from this scan alone
-                counts = np.zeros_like(tap.window)
+                counts = np.zeros((self._contract.taps, *readings.shape), dtype=np.float32)
                 counts[0] = readings
-                rows = scheduled_rows(1, 0.0) if self._contract.takes_poses else None
+                rows = scheduled_rows(1, 0.0) if self._takes_poses else None
                 step.due = Window(counts, 1, (0,), rows, NO_TAP, (NO_TAP, step.filled))
-        if self.advice is not None and not step.doubted:
-            step.next_tap = self.advice.proposal(tap)
+
+    def see(self, tap: int, z_counts: float, pose: PadPose | None) -> None:
+        """Take a pattern's tap and pose, None if it is not believed: the strongest one tells where the tap was."""
+        if tap != self._strongest[0] or z_counts >= self._strongest[1]:
+            self._strongest = tap, z_counts, pose
 
     def _window(self, step: Step, tap: TapTracker, *, scheduled: bool) -> Window:
-        taps = min(tap.taps_used, self._most)
-        if not self._contract.takes_poses:
-            counts, slots, rows = tap.window, range(taps), None
-        else:
+        if self._takes_poses:
             slots, rows = self._choose(tap, step.pose, scheduled=scheduled)
-            taps = min(taps, len(slots))
-            slots, rows = slots[:taps], rows[:taps]
-            counts = tap.window[list(slots)]
-        made_by = (tap.tap, tuple(slots), taps, step.filled, self._health.most_repeats >= REPEATS)
+            slots, rows = tuple(slots[: self._most]), rows[: self._most]
+            taps = len(slots)
+            counts = np.stack([tap.newest, *(tap.peaks[slot - 1].readings for slot in slots[1:])])
+        else:
+            taps, rows = min(1 + len(tap.peaks), self._most), None
+            slots = tuple(range(taps))
+            counts = np.zeros((self._contract.taps, *tap.newest.shape), dtype=np.float32)
+            counts[0] = tap.newest
+            for slot, peak in enumerate(tap.peaks, 1):
+                counts[slot] = peak.readings
+        made_by = (tap.tap, slots, step.filled, self._health.most_repeats >= REPEATS)
         return Window(counts, taps, slots, rows, tap.tap, made_by)
 
     def _choose(
@@ -158,7 +221,7 @@ class Taps:
         The pose is that of the newest tap's pad at this scan; without poses taps follow the paper's schedule.
         """
         if scheduled:
-            taps = min(tap.taps_used, self._scheduled)
+            taps = min(1 + len(tap.peaks), self._scheduled)
             return range(taps), scheduled_rows(taps, self._contract.angle_step_deg)
         if pose is None:
             self._leave_out(tap.tap, "tap_without_pose", "this tap has no pose: its pattern is made from it alone")
@@ -185,3 +248,18 @@ class Taps:
         if tap not in self._reported:
             self._reported.append(tap)
             self._report(kind, why)
+
+    def _propose(self, peaks: tuple[TapPeak, ...]) -> NextTap | None:
+        """Return where to touch next, the same for the same taps; None without a pose, or after a doubtful tap."""
+        tap, _, newest = self._strongest
+        if newest is None or tap != peaks[0].tap or len(peaks) >= self._most:
+            return None
+        if peaks is not self._proposed[0]:
+            seen = [
+                newest.seen_from(newest),
+                *(one.pose.seen_from(newest) for one in peaks[1:] if one.pose is not None),
+            ]
+            shift_mm = next_shift_mm(np.array([(pose.x_mm, pose.y_mm) for pose in seen]), self._contract.reach_mm)
+            proposed = None if shift_mm is None else NextTap(*shift_mm, 0.0, _reached(newest, *shift_mm))
+            self._proposed = peaks, proposed
+        return self._proposed[1]

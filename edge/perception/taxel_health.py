@@ -29,6 +29,9 @@ HOLD_NS: Final = 90_000_000
 half a second ago is another press. A reading may have arrived 60 ms before the end of its scan, the longest pause
 inside one, so no held reading is older than 150 ms. The time counts from when the reading was taken, since a reader
 that was kept from running cannot date its arrival."""
+REPEATS: Final = 5
+"""Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
+longer than 3."""
 STUCK_SCANS: Final = 20
 """Repeats of a taxel in a row that make it stuck. A living taxel sends the same three counts twice in a quarter of the
 scans in which a quarter of the taxels are new, as torn as real grips are at their source, and no run there is longer
@@ -66,7 +69,6 @@ _OVERLOADED: Final = ": overloaded, too near a magnet, or broken"
 WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
 """Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of pixels of validation
 presses. They may be too small on contacts unlike those of training."""
-MOST_KINDS: Final = 64
 
 
 class Health:
@@ -286,20 +288,16 @@ class TaxelEstimator:
     row-major, then y, z.
 
     Raises:
-        EdgeError: the covariances are of another grid, or not positive definite.
+        EdgeError: the covariances are of another grid.
     """
 
     def __init__(self, covariances: NDArray[np.floating], grid_shape: tuple[int, int]) -> None:
         channels = len(AXES) * grid_shape[0] * grid_shape[1]
-        shape = covariances.shape
-        if len(shape) != 3 or shape[1:] != (channels, channels) or not 0 < shape[0] <= MOST_KINDS:
+        if covariances.shape[1:] != (channels, channels):
             raise EdgeError(
-                f"covariances are {shape}, expected (1 to {MOST_KINDS}, {channels}, {channels}): freeze them again"
+                f"covariances are {covariances.shape}, expected (n, {channels}, {channels}): freeze them again"
             )
-        exact = covariances.astype(np.float64)
-        if not np.isfinite(exact).all() or not (np.linalg.eigvalsh(exact)[:, 0] > -ridge_of(exact)).all():
-            raise EdgeError("covariances are not positive definite: freeze them again")
-        self._covariances = ridged(exact)
+        self._covariances = ridged(covariances.astype(np.float64))
 
     def filler(self, dead: NDArray[np.bool_]) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
         """Return what puts estimates in the place of `dead` taxels (rows, cols), not all, into scans of zeroed counts.
@@ -341,13 +339,9 @@ class Kinds:
 
 
 def ridged(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return covariances (kinds, n, n) with the ridge added to the diagonal of each."""
-    return covariances + ridge_of(covariances)[:, None, None] * np.eye(covariances.shape[1])
-
-
-def ridge_of(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the ridge in squared counts for each of (kinds, n, n), for gains and noise of the individual sensor."""
-    return 2e-3 * np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
+    """Return covariances (kinds, n, n) with a ridge on each diagonal, for gains and noise of the individual sensor."""
+    ridges = 2e-3 * np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
+    return covariances + ridges[:, None, None] * np.eye(covariances.shape[1])
 
 
 def load_estimator(path: Path, grid_shape: tuple[int, int]) -> TaxelEstimator:

@@ -19,7 +19,8 @@ from edge.inference.contract import Contract
 from edge.inference.trust_model import Trust, contact_features, pose_tap_features
 from edge.perception.event import Report
 from edge.perception.result import Reason, Window, WrenchOrigin
-from edge.perception.tap_tracker import TapTracker
+from edge.perception.taps import TapTracker
+from edge.perception.taxel_health import REPEATS
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 from firmware_bridge.sensor_file.model import with_scale
@@ -32,9 +33,7 @@ MOST_DOUBT: Final = 0.61
 """RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
 
 With the others 3.5 % of simulated contacts less than 30 % off are not believed, and 34 % of those over 50 % off."""
-REPEATS: Final = 5
-"""Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
-longer than 3."""
+SUSPECTED: Final = "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
 
 
@@ -157,7 +156,8 @@ class PatternCheck:
             if scaled[0, 2].sum() >= 0.85 * scaled[number, 2].sum()
         ]
         for number in forgotten:
-            self._report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")
+            which = "the tap before" if number == 1 else "an earlier tap"
+            self._report("tap_dropped", f"{which} does not belong to this contact, and is forgotten")
         if forgotten:
             slots = window.slots
             tracker.forget([slots[tap] for tap in forgotten] if posed else range(slots[forgotten[0]], sys.maxsize))
@@ -203,8 +203,8 @@ class PatternCheck:
             reason = "beyond"  # than all presses of the training, up to 40 N, but for one in a thousand
         elif not explained:
             reason = "unexplained"
-        elif doubt is not None and not 0 <= doubt <= most_doubt(z_counts):
-            reason = "uncertain"
+        elif doubt is not None and not 0 <= doubt <= MOST_DOUBT * (z_counts / 1e3) ** 0.1:
+            reason = "uncertain"  # light contacts are wrong more often than they state
         elif self.suspected:
             reason = "sensor"
         return TrustVerdict(reason is None, reason, mismatch)
@@ -219,7 +219,7 @@ class PatternCheck:
             suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
             if suspected != self.suspected:
                 self.suspected = suspected
-                self._report("suspected" if suspected else "cleared")
+                self._report("suspected" if suspected else "cleared", SUSPECTED if suspected else "")
         self._tap, self._strongest = tap, -math.inf
 
 
@@ -240,22 +240,7 @@ def _alternates(z: NDArray[np.float32]) -> bool:
     return float(along) ** 2 > 0.9 * z.size * float(np.vdot(change, change))
 
 
-def most_doubt(z_counts: float) -> float:
-    """Return the largest doubt of a pattern that is believed, by the largest z of its contact.
-
-    Light contacts are wrong more often than they state.
-    """
-    return MOST_DOUBT * (z_counts / 1e3) ** 0.1
-
-
 def _share(log_odds: float) -> float:
     if math.isnan(log_odds):
         return 1.0
     return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))  # beyond 30 it is 0 or 1 to ten digits
-
-
-def _which(number: int, *, alone: bool) -> str:
-    if number == 1:
-        return "the tap before does"
-    ordinal = {2: "2nd", 3: "3rd"}.get(number, f"{number}th")  # of six earlier taps at most
-    return f"the {ordinal} tap before does" if alone else f"taps from the {ordinal} before on do"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import Note, Report
 from edge.perception.result import Step, age_text
-from edge.perception.tap_tracker import TapTracker
+from edge.perception.taps import TapTracker
 from edge.perception.taxel_health import Health
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.scans.mounting import Mounting

@@ -1,6 +1,5 @@
 """Models and runtimes by name, with the settings of a source; and results of scans that a program has in an array."""
 
-import threading
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -32,10 +31,10 @@ if TYPE_CHECKING:
     from edge.inference.onnx_session import ModelSession
 
 
-def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None = None) -> "ModelSession":
+def load_model(model: str | Path, threads: int = 1) -> "ModelSession":
     """Load a model, a file or a bundled one by its name, and its contract; mtsr2 to mtsr7 take as many taps at most.
 
-    `threads` share the work of one run, and `stop` ends the loading early.
+    `threads` share the work of one run.
 
     Raises:
         ModelError: the model does not exist or cannot be used; the message names the bundled ones or the fault.
@@ -44,7 +43,7 @@ def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None
     check_whole("threads", threads, 1)
     from edge.inference.onnx_session import ModelSession
 
-    return ModelSession(find_model(model), threads, stop, taps=taps_of(model))
+    return ModelSession(find_model(model), threads, taps=taps_of(model))
 
 
 def open_runtime(

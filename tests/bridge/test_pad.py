@@ -18,7 +18,6 @@ from edge_samples import (
 )
 
 from edge.errors import ModelError, UsageError, WindowError
-from edge.inference.contract import ANY_BATCH
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
@@ -132,9 +131,8 @@ class TestRuntime:
         assert model.windows[0][0, 2].flat[9] == pytest.approx(3 / gain)
         assert np.count_nonzero(model.windows[0]) == 1
 
-    @pytest.mark.parametrize("batch", [1, ANY_BATCH])
-    def test_two_sensors_in_one_call_get_what_each_gets_alone(self, tmp_path, batch):
-        contract = make_pad_contract(batch=batch, interval_factor=1.6)
+    def test_two_sensors_in_one_call_get_what_each_gets_alone(self, tmp_path):
+        contract = make_pad_contract(interval_factor=1.6)
         path = write_model(tmp_path / "pad.onnx", contract)
         pads = {"4": PAD, "6": OTHER}
         runtime = self.runtime(ModelSession(path), pad=pads)

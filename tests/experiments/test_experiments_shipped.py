@@ -9,7 +9,6 @@ from experiment_samples import grip, quick_bench, save_recordings, tables_of
 from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 
 from edge.inference.bundled import DEFAULT_MODEL, find_model
-from edge.inference.contract import ANY_BATCH
 from edge.inference.onnx_session import ModelSession
 from edge.perception.taxel_health import HOLD_SCANS
 from train.data.frozen_presses import load_frozen_presses
@@ -153,7 +152,7 @@ def test_patterns_that_are_off_are_counted_by_how_far(wide):
 
 
 def test_right_windows_are_kept_and_foreign_ones_dropped():
-    posed = {"batch": ANY_BATCH, "takes_poses": True, "reach_mm": 10.0, "unposed_taps": 4}
+    posed = {"takes_poses": True, "reach_mm": 10.0, "unposed_taps": 4}
     model = FakeModel(make_trusted_contract(output_full_scale=0.5, **posed))
     elsewhere = np.roll(press(), 2, axis=-1)
     right, wrong = (np.stack([press(), *[one] * 3])[None] for one in (press(), elsewhere))

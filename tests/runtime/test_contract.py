@@ -18,7 +18,6 @@ from firmware_bridge.scans.pad_constants import PAD_RANGES
 BROKEN_VALUES = {
     "made_for": {"poisson": [0.5, 0.4]},
     "version": 1,
-    "batch": 0,
     "taps": 0,
     "scale": "10",
     "tap_order": "oldest first",
@@ -41,7 +40,7 @@ BROKEN_VALUES = {
     "takes_gains": 1,
     "traction_scale": 2.0,
     "trust": {"forward": {}},
-    "interval_levels": {"90": [1.6, 1.6, 1.6]},
+    "interval_levels": [1.6, 1.6, 1.6, 1.6],
     "takes_poses": 1,
     "reach_mm": -1,
     "unposed_taps": 0,
@@ -120,10 +119,6 @@ def test_another_version_is_named_not_what_it_lacks(version):
         ("traction_scale", "0", "a whole number from 1 to 256, or null"),
         ("traction_scale", "true", "a whole number"),
         ("test_error", '{"1": {"psnr_db": 30.1}, "4": 33.2}', "a map from taps to metrics"),
-        ("interval_levels", '{"90": [1, 1, 1, 0]}', "for each percentage a positive number"),
-        ("interval_levels", '{"100": [1, 1, 1, 1]}', "for each percentage a positive number"),
-        ("interval_levels", '{"most": [1, 1, 1, 1]}', "for each percentage a positive number"),
-        ("interval_levels", '{"90": [1, 1, 1, "1"]}', "for each percentage a positive number"),
         *(
             ("made_for", text, "a map to two numbers, of names of: thickness_mm, .*, gains_certainty")
             for text in (
@@ -149,7 +144,7 @@ POSED = {"takes_poses": "true"}
     [
         *(
             (SMALL | {key: str(most)}, {key: str(most + 1)}, f"1 to {most}")
-            for key, most in {"batch": 1024, "taps": 64, "rows": 64, "cols": 64}.items()
+            for key, most in {"taps": 64, "rows": 64, "cols": 64}.items()
         ),
         (SMALL | {"scale": "256"}, {"scale": "257"}, "1 to 256"),
         ({"rows": "64", "cols": "64", "scale": "16"}, {"scale": "17"}, "patterns of at most 1048576 pixels"),

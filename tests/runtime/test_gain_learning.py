@@ -16,7 +16,6 @@ from edge.perception.contact_options import RuntimeOptions
 from edge.perception.gain_learning import (
     BOUND,
     CONTRADICTED_CONTACTS,
-    HELD_SCANS,
     ContactModel,
     GainLearner,
     Learn,
@@ -156,9 +155,7 @@ def learning_of(measured, used=None, check=None):
 
 
 def held(learn, contact, trusted=None):
-    """Return whether another pad is in use after a scan of a contact."""
-    step, made = SimpleNamespace(force_counts=5000.0), SimpleNamespace(trusted=trusted)
-    return learn(step, made, contact, ALL_ALIVE)
+    learn(SimpleNamespace(force_counts=5000.0), SimpleNamespace(trusted=trusted), contact)
 
 
 class TestStage:
@@ -187,28 +184,24 @@ class TestStage:
 
     def test_an_untrusted_scan_teaches_nothing(self):
         (learn, _, _), contact = learning_of(None), draw_contacts(1)[0]
-        for _ in range(2 * HELD_SCANS):
-            assert not held(learn, contact, trusted=False)
-        assert not learn.waiting
-        for trusted in (None, False):
+        for trusted in (False, None, False):
             held(learn, contact, trusted)
             assert learn.waiting == (trusted is None)
 
 
-def scans_of(contacts, noise=0.0, holds=1):
-    """Return scans of contacts, each held for so many and followed by a free pad, as is the first."""
+def scans_of(contacts, noise=0.0):
+    """Return a scan of each contact, followed by a free pad, as is the first."""
     series, rng, scans = ScanSeries("4", USPA44), np.random.default_rng(3), []
-    for felt in [FREE, *(one for contact in contacts for one in [contact] * holds + [FREE])]:
+    for felt in [FREE, *(one for contact in contacts for one in (contact, FREE))]:
         counts = np.rint(BASELINE.counts + felt + rng.normal(0, noise, FREE.shape)).astype(np.int32)
         scans.append(series.close(counts, 10_000_000 * (len(scans) + 1)))
     return scans
 
 
-def learning(scans, *, learn=True, every_scan=False):
+def learning(scans, *, learn=True):
     """Return the runtime that has learned from these scans, its model, and the results."""
     model = FakeModel(make_pad_contract(taps=1))
-    options = RuntimeOptions(learn=learn, every_scan=every_scan)
-    runtime = make_runtime(model, contacts=MODEL, options=options)
+    runtime = make_runtime(model, contacts=MODEL, options=RuntimeOptions(learn=learn))
     return runtime, model, [runtime.push(scan) for scan in scans]
 
 
@@ -229,11 +222,6 @@ class TestRuntime:
         runtime, _, results = learning(scans, learn=False)
         assert not any(result.events for result in results)
         assert runtime.take_learned() == {} and results[-1].gains_certainty is None
-
-    def test_a_long_hold_is_learned_from_while_it_lasts(self):
-        scans = scans_of(draw_contacts(14, draw_gains()), holds=HELD_SCANS + 5)
-        scans = [one for number, one in enumerate(scans) if number % (HELD_SCANS + 6)]  # never free
-        assert any(result.events for result in learning(scans, every_scan=True)[2])
 
 
 LEARNED = Pad(gains=tuple(draw_gains().round(4).tolist()), gain_half_widths=(0.05,) * GAINS)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, REST, inferred
+from edge_samples import BASELINE, PERIOD_NS, inferred
 from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_posed_model
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
@@ -226,6 +226,7 @@ def test_an_earlier_tap_is_not_touched_again_and_in_reach():
     shift_mm = next_shift_mm(np.array([[0.0, 0.0], [-HALF_MM, 0.0]]), 3.4)
     assert shift_mm is not None and np.hypot(shift_mm[0] + HALF_MM, shift_mm[1]) <= 3.4
     assert next_shift_mm(np.zeros((1, 2)), 2.0) is None
+    assert next_shift_mm(np.array([[0.0, 0.0], [5.0, 0.0], [-5.0, 0.0]]), 5.1) is None, "none is in reach of all"
 
 
 def test_a_robot_that_follows_touches_no_place_twice():
@@ -268,17 +269,20 @@ def test_it_is_from_the_strongest_scan_since_a_reset():
     assert proposed is not None and proposed.target.x_mm - proposed.dx_mm == pytest.approx(5)
 
 
-@pytest.mark.parametrize("lacking", ["a pose", "trust", "a further tap"])
-def test_nothing_is_proposed_without_what_it_needs(lacking):
-    checked = make_checked_contract(make_posed_trust(2.5))
-    pad = make_pad(checked if lacking == "trust" else SURE, taps=1 if lacking == "a further tap" else None)
-    if lacking != "a pose":
-        pad.place(PadPose(0, 0))
-    pressed = REST.copy()
-    pressed[2, 1, 1] += PRESS
-    pressed[0, 0, 0] += PRESS  # which is unfamiliar to the checks
-    for counts in (pressed, pressed, REST):
-        scan = pad.scan()
-        scan.counts[...] = counts
-        result = pad.runtime.push(scan)
-    assert result.state == "idle" and result.next_tap is None
+def test_nothing_is_proposed_without_a_pose_or_a_further_tap():
+    free, full = make_pad(SURE), make_pad(SURE, taps=1)
+    free.tap()
+    full.tap(PadPose(0, 0))
+    assert free.push().next_tap is full.push().next_tap is None
+
+
+@pytest.mark.parametrize("strange", [(0, PRESS), (PRESS, 0)])
+def test_a_tap_is_followed_if_its_strongest_pattern_is_believed(strange):
+    """Readings of x on the first taxel are unfamiliar to the checks."""
+    pad = make_pad(replace(make_checked_contract(make_posed_trust(2.5)), output_full_scale=10.0))
+    pad.place(PadPose(0, 0))
+    for press, x in zip((PRESS, 0.8 * PRESS), strange, strict=True):
+        scan = pad.scan(press)
+        scan.counts[0, 0, 0] += x
+        pad.runtime.push(scan)
+    assert (pad.push().next_tap is None) == (strange[0] > 0)

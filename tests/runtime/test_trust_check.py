@@ -9,13 +9,13 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import FOREIGN_TAXEL, make_trust, make_trusted_contract
 
 from edge.api import Pad
-from edge.inference.contract import ANY_BATCH, scheduled_rows
+from edge.inference.contract import scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
+from edge.perception.taxel_health import REPEATS
 from edge.perception.trust_check import (
     LEAST_COUNTS,
     MOST_MISMATCH,
-    REPEATS,
     PatternCheck,
     SensorPad,
     TrustVerdict,
@@ -199,7 +199,7 @@ ELSEWHERE = 10
 
 
 def make_pad(model=None, options=EVERY, **settings):
-    posed = {"batch": ANY_BATCH, "takes_poses": True, "reach_mm": 10.0, "unposed_taps": 4}
+    posed = {"takes_poses": True, "reach_mm": 10.0, "unposed_taps": 4}
     model = model or FakeModel(make_trusted_contract(**posed))
     return Pushed(make_runtime(model, options=options, **settings), taxel=FOREIGN_TAXEL, noise=3)
 
@@ -211,12 +211,6 @@ def counted(pad, counts):
 
 
 class TestTaps:
-    def test_taps_of_one_contact_are_kept(self):
-        pad = make_pad()
-        taps = [pad.tap() for _ in range(5)]
-        assert [one.taps_used for one in taps] == [1, 2, 3, 4, 4] and pad.kinds == []
-        assert max(taps[-1].tap_mismatch) < 0.5
-
     def test_a_foreign_tap_is_dropped_with_those_before_it(self):
         pad = make_pad()
         pad.tap()

@@ -233,7 +233,7 @@ def test_a_contact_begins_moves_and_ends_once():
     assert told(events, [held, free, held, free, held]) == [], "a flicker is no contact"
 
 
-@pytest.mark.parametrize("limit", [{"slip_ratio": float("nan")}, {"move_mm": -1.0}, {"reach_mm": 0}, {"scans": None}])
+@pytest.mark.parametrize("limit", [{"slip_ratio": float("nan")}, {"move_mm": -1.0}])
 def test_a_limit_that_is_never_reached_is_refused(limit):
     with pytest.raises(UsageError, match="expected a positive number"):
         PatchEvents(CONTRACT, **limit)

@@ -43,7 +43,6 @@ BASELINE = Baseline.of("4", REST.astype(np.float32), created_unix_s=1000.0, scan
 def make_contract(**changes) -> Contract:
     values = {
         "version": CONTRACT_VERSION,
-        "batch": 1,
         "taps": 4,
         "scale": 10,
         "tap_order": "newest first",

@@ -7,7 +7,6 @@ from edge_samples import FakeModel, make_contract, save_graph, tiny_deviation, t
 from onnx import helper
 
 from edge.inference.contract import (
-    ANY_BATCH,
     DEVIATION_NAME,
     INPUT_NAME,
     OUTPUT_NAME,
@@ -21,7 +20,7 @@ WEIGHTS = np.array([0.5, 0.25, 0.0625, 2.0, 0.125], dtype=np.float32)
 
 def make_posed_contract(**changes) -> Contract:
     """Return the contract of the model."""
-    return make_contract(**({"batch": ANY_BATCH, "taps": 7, "takes_poses": True, "reach_mm": 10.0} | changes))
+    return make_contract(**({"taps": 7, "takes_poses": True, "reach_mm": 10.0} | changes))
 
 
 def posed_pattern(window: np.ndarray, poses: np.ndarray) -> np.ndarray:

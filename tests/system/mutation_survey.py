@@ -74,7 +74,10 @@ SUBJECTS = {
             "tests/bridge/test_cycles.py",
         ),
     ),
-    "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_taps.py",)),
+    "taps": Subject(
+        "edge.perception.taps",
+        ("tests/runtime/test_taps.py", "tests/runtime/test_pose_runtime.py", "tests/runtime/test_baseline_doubt.py"),
+    ),
     "baseline": Subject("firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py",)),
     "drift": Subject("firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift.py",)),
     "contract": Subject(

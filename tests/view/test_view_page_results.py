@@ -155,7 +155,7 @@ def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page):
 
         forgotten = "the tap before does not belong to this contact, and is forgotten"
         tell(shown, "tap_dropped", "4", forgotten)
-        tell(shown, "suspected", "4", "")
+        tell(shown, "suspected", "4", "several contacts in a row read like none")
         logged(page, f"sensor 4: {forgotten}")
         suspected = re.compile("several contacts in a row read like none")
         playwright.expect(page.locator("#log .bad")).to_have_text(suspected)
