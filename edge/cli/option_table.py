@@ -230,24 +230,21 @@ examples:
     ),
     "convert": Subcommand(
         "edge.cli.convert_command:run",
-        "Writes a recording in another format: that of the ending of the new name.",
+        "Writes an .mcap in another format: that of the ending of the new name.",
         (
             Group(
                 "recording",
-                Option("recording FILE", str, "recording, .mcap, .npz or .csv"),
-                Option("new NEW", str, "new file, .mcap, .npz or .csv"),
-                Option("--rate-hz R", positive, "scans a second of a .csv that does not state it"),
+                Option("recording FILE", str, "recording, .mcap"),
+                Option("new NEW", str, "new file, .npz or .csv"),
             ),
         ),
         """\
-Formats: .mcap holds all that was recorded, .npz arrays for numpy, .csv counts, times and poses of one sensor (of \
-several a file each); the last two are made of an .mcap. What the new file cannot hold is printed. Nothing is \
-computed, and no file is replaced.
+Formats: .npz holds arrays for numpy, .csv counts, times and poses of one sensor (of several a file each). What the \
+new file cannot hold is printed. Nothing is computed, and no file is replaced.
 
 examples:
   edge-sr convert press.mcap press.npz
   edge-sr convert press.mcap press.csv
-  edge-sr convert old.npz old.mcap
 """,
     ),
     "map": Subcommand(

@@ -85,8 +85,8 @@ class McapScans:
     ) -> None:
         """Begin the file; one that exists is left alone.
 
-        Without the mountings of the sensors, axes would point elsewhere when the file is played again. The offset is 0
-        where the time of recording is unknown, and None for the clocks as they are now. `facts` are further metadata.
+        Without the mountings of the sensors, axes would point elsewhere when the file is played again. The offset is
+        None for the clocks as they are now. `facts` are further metadata.
 
         Raises:
             SinkError: the file exists, or cannot be written.

@@ -97,7 +97,7 @@ def test_sources_without_a_name_are_called_by_their_place(tmp_path):
 def test_an_npz_at_its_recorded_times_or_at_another_rate(tmp_path):
     counts = make_counts(4)
     times_ns = [500, 500 + 3 * MS, 500 + 30 * MS, 500 + 33 * MS]
-    path = write_npz(tmp_path / "both.npz", counts, times_ns, ["4", "6", "4", "6"], rate_hz=1.0)
+    path = write_npz(tmp_path / "both.npz", counts, times_ns, ["4", "6", "4", "6"])
     for rate_hz, due_ms in ((None, [0, 3, 30, 33]), (10, [0, 0, 100, 100])):
         time, scans = FakeTime(), []
         with replay(time, path, rate_hz=rate_hz) as link:

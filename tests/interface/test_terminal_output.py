@@ -136,7 +136,6 @@ ODD = ["a  b", "it's", "a;b$c`d", "tab\there\nthere", "\x1b[31mred", "back\\slas
 @pytest.mark.parametrize(
     ("command", "advice", "meant"),
     [
-        (["convert", "NAME.npz", "NAME.csv"], "becomes no .csv: ", ["NAME.npz", "NAME.mcap", "NAME.mcap", "NAME.csv"]),
         (["record", "NAME.npz"], "cannot be recorded: ", ["NAME.mcap", "NAME.mcap", "NAME.npz"]),
         (["--sink", "npz:NAME.npz"], ", then ", ["NAME.mcap", "NAME.npz"]),
         (["--source", "NAME.csv"], "did you mean ", ["replay:NAME.csv"]),
