@@ -163,7 +163,7 @@ class _Rows:
         sensor, _, name = channel.topic.rpartition("/")
         return _Topic(sensor, name, MessageType.of(schema.name, schema.data.decode()))
 
-    def _read(self, topic: _Topic, log_ns: int, data: memoryview) -> None:
+    def _read(self, topic: _Topic, log_ns: int, data: bytes) -> None:
         if topic.kind.name == SCAN_NAME:
             self._of, self._row = topic.sensor, self._begun(data, log_ns)
         elif topic.kind.name == BASELINE_NAME:
@@ -178,7 +178,7 @@ class _Rows:
         elif topic.name in _MAP_NAMES:
             self._row |= {topic.name: recorded_map(data) / np.float32(UNITS[topic.name].factor), "has_pattern": True}
 
-    def _begun(self, data: memoryview, log_ns: int) -> dict[str, Any]:
+    def _begun(self, data: bytes, log_ns: int) -> dict[str, Any]:
         scan = decode_scan(data, self._geometry)
         row: dict[str, Any] = {
             "time_ns": scan.time_ns,

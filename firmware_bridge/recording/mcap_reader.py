@@ -46,7 +46,6 @@ from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
 
 MOST_KEPT_BYTES: Final = 1 << 31  # most bytes of the scans in memory: a day of one sensor at 100 Hz
-MOST_SHOWN_TOPICS: Final = 10
 
 
 @dataclass
@@ -104,7 +103,6 @@ class _Reading:
     def __init__(self, path: Path) -> None:
         self.notes: list[str] = []
         self._path = path
-        self._topics: dict[int, str] = {}
         self._sensors: dict[str, _Sensor] = {}  # those with scans in the order of the first ones
         self._geometry = USPA44  # for files that name no geometry
         self._named = False  # whether metadata or a message names it
@@ -117,15 +115,14 @@ class _Reading:
 
     def topic_of(self, channel: Channel, schema: Schema | None) -> tuple[str, MessageType] | None:
         """Return the name of a topic and the type of its messages, None for one that is not of edge-sr."""
-        self._topics[channel.id] = name = channel.topic[:60]
         kind = None if schema is None or channel.message_encoding != "cdr" else self._kind_of(schema)
-        return kind and (name, kind)
+        return kind and (channel.topic[:60], kind)
 
     def recording(self) -> Recording:
         """Return what was read; a RecordingError without scans."""
         scanned = {name: entry for name, entry in self._sensors.items() if entry.times_ns}
         if not scanned:
-            self._refuse(f"no scans that edge-sr recorded{self._instead()}")
+            self._refuse("; ".join(["no scans that edge-sr recorded", *self.notes]))
         bare = [] if self._described else sorted(name for name, entry in scanned.items() if entry.facts is None)
         if bare:
             self.notes.append(
@@ -199,7 +196,7 @@ class _Reading:
             self._refuse(f"no geometry of its sensors: {short(error)}")
         self._geometry, self._named = geometry, True
 
-    def _take_facts(self, data: memoryview) -> None:
+    def _take_facts(self, data: bytes) -> None:
         fields = SENSOR.decode(data)
         sensor, text = fields["sensor"], fields["facts"]
         entry = self._sensor(sensor)
@@ -214,7 +211,7 @@ class _Reading:
             raise CdrError(f"facts of sensor {sensor[:20]!r} that cannot be read: {short(error)}") from error
         entry.facts = text
 
-    def take_message(self, topic: tuple[str, MessageType], log_ns: int, data: memoryview) -> None:
+    def take_message(self, topic: tuple[str, MessageType], log_ns: int, data: bytes) -> None:
         """Process a message of a topic, logged at a time in [ns] since 1970."""
         name, kind = topic
         try:
@@ -273,15 +270,6 @@ class _Reading:
                 f"{self._path}: sensor {baseline.sensor} was zeroed again while it was recorded ({before.id}, then "
                 f"{baseline.id}); played again it keeps to the baseline of its beginning"
             )
-
-    def _instead(self) -> str:
-        if self.notes:
-            return f"; {self.notes[0]}"
-        names = list(self._topics.values())
-        if not names:
-            return ", and no topics"
-        more = f", and {len(names) - MOST_SHOWN_TOPICS} more" if len(names) > MOST_SHOWN_TOPICS else ""
-        return f"; its topics are {', '.join(map(repr, names[:MOST_SHOWN_TOPICS]))}{more}"
 
     def _refuse(self, why: str) -> NoReturn:
         raise RecordingError(f"{self._path}: {why}")
