@@ -127,7 +127,7 @@ class _Reading:
         if bare:
             self.notes.append(
                 f"{self._path}: the mounting of sensor {', '.join(bare)} is not in the file, as after a tool that "
-                "copies a part of it: its axes and gains are those of the id map, unless --sensor FILE gives others"
+                "copies a part of it: its axes are those of the id map, unless --sensor FILE gives others"
             )
         return Recording(
             self._path,

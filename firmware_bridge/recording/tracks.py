@@ -134,10 +134,10 @@ def read_mounting(text: str, taxel_count: int) -> Mounting:
     """
     try:
         fields = json.loads(text)
-        order, signs, gains = (tuple(fields[key]) for key in ("order", "signs", "gains"))
+        order, signs = tuple(fields["order"]), tuple(fields["signs"])
         if not all(type(value) is int for value in (*order, *signs)) or type(fields["swap_xy"]) is not bool:
             raise ValueError("not whole numbers")
-        return Mounting(order, fields["swap_xy"], signs, tuple(map(float, gains)), taxel_count)
+        return Mounting(order, fields["swap_xy"], signs, taxel_count)
     except (TypeError, KeyError, RecursionError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from error
 

@@ -109,14 +109,11 @@ def _text(sensor_file: SensorFile) -> str:
 def _tables(entry: SensorEntry, shape: tuple[int, int, int]) -> dict[str, list[str]]:
     """Return the lines of an entry's tables, by what follows the sensor's name in theirs."""
     mounting, frame, baseline = entry.mounting, entry.frame, entry.baseline
-    gains = np.reshape(mounting.gains, shape)
-    alike = bool((gains == gains[:, :1, :1]).all())
     own = [
         "# Which taxel of the model's map lies at each place, seen from above, as patterns are drawn.",
         *_line("order", np.reshape(mounting.order, shape[1:]).tolist()),
         *_line("swap_xy", mounting.swap_xy),
         *_line("signs", mounting.signs, "of x (to the right), y (down) and z (into the pad), after the swap"),
-        *_line("gains", gains[:, 0, 0].tolist() if alike else gains.tolist(), "of x, y and z"),
         *_line("counts_per_newton", entry.counts_per_newton, "of the summed z"),
         *_line("counts_per_newton_interval", entry.counts_per_newton_interval, "90 %"),
         *_line("assumed", sorted(entry.assumed, key=PARTS.index) or None, "as wired; not measured"),

@@ -131,7 +131,7 @@ def test_a_pad_of_a_programs_own_is_an_object(tmp_path):
 
 
 def test_a_sensor_file_has_the_grid_of_its_model(tmp_path):
-    turned = Mounting(tuple(reversed(range(24))), gains=tuple(np.linspace(0.9, 1.1, 72).tolist()), taxel_count=24)
+    turned = Mounting(tuple(reversed(range(24))), taxel_count=24)
     pad = Pad(thickness_mm=5.0, gains=(1.5,) * 72)
     written = SensorFile("uSPa46", None, {"4": SensorEntry(turned, 1180.0, BASELINE, pad)})
     save_sensor_file(tmp_path / "s.toml", written)
