@@ -30,11 +30,8 @@ from firmware_bridge.recording.scan_messages import (
     scan_type,
 )
 from firmware_bridge.recording.tracks import (
-    GEOMETRY_METADATA,
     MOST_POSES,
     MOST_SENSORS,
-    MOUNTING_METADATA,
-    SOURCE_METADATA,
     Recording,
     Track,
     origin_of,
@@ -85,9 +82,7 @@ def load_mcap(path: Path) -> Recording:
     with path.open("rb") as file:
         try:
             for record in messages(file, reading.topic_of):
-                if isinstance(record, Metadata):
-                    reading.take_metadata(record.name, record.metadata)
-                else:
+                if not isinstance(record, Metadata):
                     reading.take_message(*record)
         except CutOffError as end:
             reading.notes.insert(0, f"{path} breaks off ({end}): its recording was killed, or the disk was full")
@@ -105,9 +100,8 @@ class _Reading:
         self._path = path
         self._sensors: dict[str, _Sensor] = {}  # those with scans in the order of the first ones
         self._geometry = USPA44  # for files that name no geometry
-        self._named = False  # whether metadata or a message names it
+        self._named = False  # whether a message names it
         self._sized = False  # whether a message's definition holds its number of taxels
-        self._described = False  # whether there are metadata
         self._offset_ns: int | None = None
         self._kept_bytes = 0
         self._poses: list[TimedPose] = []
@@ -123,7 +117,7 @@ class _Reading:
         scanned = {name: entry for name, entry in self._sensors.items() if entry.times_ns}
         if not scanned:
             self._refuse("; ".join(["no scans that edge-sr recorded", *self.notes]))
-        bare = [] if self._described else sorted(name for name, entry in scanned.items() if entry.facts is None)
+        bare = sorted(name for name, entry in scanned.items() if entry.facts is None)
         if bare:
             self.notes.append(
                 f"{self._path}: the mounting of sensor {', '.join(bare)} is not in the file, as after a tool that "
@@ -161,27 +155,6 @@ class _Reading:
         self._sized = self._sized or schema.name in (SCAN_NAME, BASELINE_NAME)
         return wanted
 
-    def take_metadata(self, name: str, fields: Mapping[str, str]) -> None:
-        """Process a record of metadata."""
-        self._described = True
-        self._take_named(name, fields)
-
-    def _take_named(self, name: str, fields: Mapping[str, str]) -> None:
-        if name == SOURCE_METADATA:
-            self._origin = origin_of({fields.get("kind", ""), self._origin or ""} - {""})
-        elif name == GEOMETRY_METADATA:
-            self._take_geometry(fields)
-        elif name == MOUNTING_METADATA:
-            sensor = fields.get("sensor", "")
-            try:
-                mounting = read_mounting(fields.get("mounting", ""), self._geometry.taxel_count)
-            except ValueError as error:
-                self._refuse(f"no mounting of sensor {sensor[:20]!r}: {short(error)}")
-            entry = self._sensor(sensor)
-            if entry.mounting not in (None, mounting):
-                self._refuse(f"two mountings of sensor {sensor[:20]!r}, expected one: cut it in parts")
-            entry.mounting = mounting
-
     def _take_geometry(self, fields: Mapping[str, str]) -> None:
         try:
             geometry = SensorGeometry(**{key: json.loads(text) for key, text in fields.items()})
@@ -196,6 +169,15 @@ class _Reading:
             self._refuse(f"no geometry of its sensors: {short(error)}")
         self._geometry, self._named = geometry, True
 
+    def _take_mounting(self, sensor: str, entry: _Sensor, text: str) -> None:
+        try:
+            mounting = read_mounting(text, self._geometry.taxel_count)
+        except ValueError as error:
+            self._refuse(f"no mounting of sensor {sensor[:20]!r}: {short(error)}")
+        if entry.mounting not in (None, mounting):
+            self._refuse(f"two mountings of sensor {sensor[:20]!r}, expected one: cut it in parts")
+        entry.mounting = mounting
+
     def _take_facts(self, data: bytes) -> None:
         fields = SENSOR.decode(data)
         sensor, text = fields["sensor"], fields["facts"]
@@ -203,8 +185,16 @@ class _Reading:
         if entry.facts == text:
             return
         try:
-            for name, values in json.loads(text).items():
-                self._take_named(name, {str(key): str(value) for key, value in values.items()})
+            facts = {
+                name: {str(key): str(value) for key, value in values.items()}
+                for name, values in json.loads(text).items()
+            }
+            if "source" in facts:
+                self._origin = origin_of({facts["source"].get("kind", ""), self._origin or ""} - {""})
+            if "geometry" in facts:
+                self._take_geometry(facts["geometry"])
+            if "mounting" in facts:
+                self._take_mounting(sensor, entry, facts["mounting"].get("mounting", ""))
         except RecordingError:
             raise
         except (ValueError, AttributeError, RecursionError) as error:

@@ -19,9 +19,6 @@ from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 if TYPE_CHECKING:
     from firmware_bridge.zeroing.baseline import Baseline
 
-GEOMETRY_METADATA: Final = "geometry"  # name of the MCAP metadata that holds the pad of all sensors
-MOUNTING_METADATA: Final = "mounting"  # name of the MCAP metadata that hold the mounting of a sensor each
-SOURCE_METADATA: Final = "source"  # name of the MCAP metadata that holds the kind of source
 HIGHEST_COUNT: Final = 0xFFFF
 MOST_SENSORS: Final = 64  # most sensors of a recording; one wire can have sixteen
 MOST_POSES: Final = 1 << 23  # most poses of a recording: those of a day at 100 Hz, in 3 GB

@@ -39,7 +39,7 @@ from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.scan_messages import decode_baseline, decode_scan
+from firmware_bridge.recording.scan_messages import SENSOR, decode_baseline, decode_scan
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import PadFrame, SensorEntry, SensorFile
@@ -97,7 +97,8 @@ class TestSink:
         assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}, "ros2 bag wants one"
         assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
         assert json.loads(metadata["contract"]["counts_per_unit"]) == [500.0, 500.0, 1000.0]
-        assert json.loads(metadata["geometry"]["pitch_mm"]) == 4.7 and metadata["source"] == {"kind": "device"}
+        facts = json.loads(SENSOR.decode(by_topic["/s4/sensor"][0][1])["facts"])
+        assert json.loads(facts["geometry"]["pitch_mm"]) == 4.7 and facts["source"] == {"kind": "device"}
 
     def test_a_baseline_is_recorded_from_its_first_use_and_noted(self, tmp_path):
         results = make_results([make_scan(number, noise=3) for number in range(6)])

@@ -9,7 +9,7 @@ import pytest
 import zstandard
 from edge_samples import FakeModel, make_contract
 from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Schema
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from mcap_samples import OFFSET_NS
 
@@ -145,7 +145,10 @@ def of_scans(*changes, **settings):
             for said in ("", "[]", "[" * 5000, '{"mounting": 1}', '{"mounting": {}}', '{"geometry": {"rows": "9"}}')
         ),
         *(
-            ("no mounting of sensor '4'", (Metadata("mounting", {"sensor": "4", "mounting": said}),))
+            (
+                "no mounting of sensor '4'",
+                (*OF_A_SENSOR, message(SENSOR, GOOD | {"facts": json.dumps({"mounting": {"mounting": said}})}, 2)),
+            )
             for said in (
                 *("", "[]", "{}", "[" * 5000),
                 json.dumps(SEATED | {"order": [0] * 16}),

@@ -167,7 +167,7 @@ def test_a_full_disk_leaves_nothing(new, long):
 def test_ctrl_c_leaves_nothing(long):
     command = [sys.executable, "-c", RUN, str(10**9), "press.mcap", "new.npz"]
     with subprocess.Popen(command, cwd=long.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        while not list(long.parent.glob(".new.npz.*")) and process.poll() is None:
+        while not list(long.parent.glob(".new.npz.*/new.npz")) and process.poll() is None:
             time.sleep(0.001)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
