@@ -64,16 +64,6 @@ def test_the_ids_of_each_layout(model, sensor, ids):
     assert [model.taxels[can_id] for can_id in ids] == [(sensor, taxel) for taxel in range(16)]
 
 
-@pytest.mark.parametrize(
-    ("model", "sensors", "triggered"),
-    [(USPA44_MAP, 16, False), (XR1944_MAP, 16, False), (LAYOUT_A_MAP, 7, True), (LAYOUT_B_MAP, 14, True)],
-)
-def test_every_sensor_has_every_taxel_once(model, sensors, triggered):
-    names = {sensor for sensor, _ in model.taxels.values()}
-    assert (len(names), len(model.taxels), model.triggered) == (sensors, 16 * sensors, triggered)
-    assert all(sorted(taxel for _, taxel in model.wire_order(sensor)) == [*range(16)] for sensor in names)
-
-
 mountings = st.builds(
     Mounting,
     order=st.permutations(AS_MAPPED).map(tuple),
