@@ -62,6 +62,7 @@ def test_golden_frames(can_id, data, place, counts):
 )
 def test_the_ids_of_each_layout(model, sensor, ids):
     assert [model.taxels[can_id] for can_id in ids] == [(sensor, taxel) for taxel in range(16)]
+    assert model.triggered == (model in (LAYOUT_A_MAP, LAYOUT_B_MAP))
 
 
 mountings = st.builds(

@@ -114,6 +114,7 @@ def text_of(**changes):
         ("order", GRID.replace("[12,", "[12, 13,"), "4 rows of 4"),
         ("swap_xy", "1", "true or false"),
         ("signs", "[1, 1, 2]", "1 or -1 for each of x, y, z"),
+        ("signs", "[1, 1, true]", "1 or -1"),
         *(("counts_per_newton", value, "a number from 0.001 to 1e+06") for value in ("nan", "1" + "0" * 400)),
         *(("counts_per_newton_interval", value, "around counts_per") for value in ("[1200, 1300]", "[1000, 1100]")),
         ("counts_per_newton_interval", "[1300, 1000]", "the lower first"),
