@@ -13,7 +13,6 @@ from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.links.registry import FORMS as SOURCES
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.pad_constants import PAD_RANGES
-from firmware_bridge.zeroing.baseline import FEWEST_RECORDED, FEWEST_SCANS
 
 _SETTINGS: Final[dict[Any, Any]] = {bool: {"action": "store_true"}, list: {"action": "append", "default": []}}
 """Settings of argparse for an option without a value, and for one that may be repeated."""
@@ -230,24 +229,21 @@ examples:
     ),
     "convert": Subcommand(
         "edge.cli.convert_command:run",
-        "Writes a recording in another format: that of the ending of the new name.",
+        "Writes an .mcap in another format: that of the ending of the new name.",
         (
             Group(
                 "recording",
-                Option("recording FILE", str, "recording, .mcap, .npz or .csv"),
-                Option("new NEW", str, "new file, .mcap, .npz or .csv"),
-                Option("--rate-hz R", positive, "scans a second of a .csv that does not state it"),
+                Option("recording FILE", str, "recording, .mcap"),
+                Option("new NEW", str, "new file, .npz or .csv"),
             ),
         ),
         """\
-Formats: .mcap holds all that was recorded, .npz arrays for numpy, .csv counts, times and poses of one sensor (of \
-several a file each); the last two are made of an .mcap. What the new file cannot hold is printed. Nothing is \
-computed, and no file is replaced.
+Formats: .npz holds arrays for numpy, .csv counts, times and poses of one sensor (of several a file each). What the \
+new file cannot hold is printed. Nothing is computed, and no file is replaced.
 
 examples:
   edge-sr convert press.mcap press.npz
   edge-sr convert press.mcap press.csv
-  edge-sr convert old.npz old.mcap
 """,
     ),
     "map": Subcommand(
@@ -295,16 +291,7 @@ All other options are those of edge-sr: its --help lists sources, outputs and ke
         "Measures the free pad once, and stores its readings: the baseline, which is subtracted from each scan.",
         (
             Group("sensor", *SENSOR),
-            Group(
-                "baseline",
-                Option("--out FILE", Path, "file for the baseline", required=True),
-                Option(
-                    "--scans N",
-                    whole(FEWEST_RECORDED),
-                    f"scans to average (default and minimum {FEWEST_SCANS}; of a recording at least {FEWEST_RECORDED})",
-                ),
-                Option("--skip N", whole(0), "scans to leave out at the start (default 0)"),
-            ),
+            Group("baseline", Option("--out FILE", Path, "file for the baseline", required=True)),
         ),
         """\
 Keep the pad still, with nothing touching it.
@@ -313,10 +300,9 @@ examples:
   edge-sr baseline --out zero.json
   edge-sr --baseline zero.json
 
-Of a recording it takes the scans during which the pad is still and pressed least, or those that you name:
+Of a recording it takes the scans during which the pad is still and pressed least:
   edge-sr baseline --out zero.json \\
-          --source replay:f.csv \\
-          --skip 190 --scans 60
+          --source replay:f.csv
 """,
     ),
     "devices": Subcommand(

@@ -188,7 +188,7 @@ class Runtime:
     Attributes:
         estimator: of dead taxels, on the same grid; without it there is no pattern while a taxel is dead.
         contacts: distribution of contacts by which gains are learned, if the options ask for that; without it none are.
-        mountings: directions of a sensor's axes, and its gains, by name; without one the axes are as wired.
+        mountings: directions of a sensor's axes, by name; without one the axes are as wired.
         measured: pads without what was learned, by name, from which learning begins; None for `pad`.
         scale_intervals: 90 % intervals of counts per newton, by name.
         unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;

@@ -2,7 +2,6 @@
 
 import math
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,6 @@ from edge.terminal.progress_bar import progress
 from firmware_bridge.errors import BaselineRefusedError, as_typed
 from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
@@ -60,7 +58,7 @@ def open_recording(
     stored = with_recorded(file, [replay])
     baselines: dict[str, Baseline] = {}
     for recording in () if zero else replay.recordings:
-        baselines |= _in_its_time(recording, paced=paced)
+        baselines |= recording.baselines
     if not zero:
         baselines = baselines or stored.baselines
         baselines |= free_baselines(replay, stored.mountings, baselines, rate_hz=rate_hz)
@@ -142,7 +140,7 @@ def free_baselines(
             if raw and name in mountings:
                 stretch = stretch._replace(counts=mountings[name].place_counts(stretch.counts))
             created_s = math.nan
-            if recording.unix_offset_ns and track.time_ns is not None:  # 0: the time of recording was unknown even then
+            if recording.unix_offset_ns is not None and track.time_ns is not None:
                 created_s = (int(track.time_ns[last]) + recording.unix_offset_ns) / 1e9
             baselines[name] = stretch.baseline(name, created_s)
     return baselines
@@ -175,16 +173,3 @@ class _FollowedReplay(ReplayLink):
         scans = super().read(timeout_s)
         self._bar.update(len(scans))
         return scans
-
-
-def _in_its_time(recording: Recording, *, paced: bool) -> dict[str, Baseline]:
-    """Return a recording's baselines; if it is paced and undated, dated so that they keep their ages at its scans."""
-    baselines = dict(recording.baselines)
-    if not paced or recording.unix_offset_ns:  # 0: the time of recording was unknown even then
-        return baselines
-    firsts_ns = {track.sensor: track.time_ns[0] for track in recording.tracks if track.time_ns is not None}
-    now_s = time.time()
-    return {
-        name: replace(baseline, created_unix_s=now_s - (firsts_ns[name] / 1e9 - baseline.created_unix_s))
-        for name, baseline in baselines.items()
-    }

@@ -4,7 +4,7 @@ import csv
 import json
 import shutil
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple
 from pathlib import Path
@@ -19,21 +19,21 @@ from numpy.typing import NDArray
 from edge.errors import SinkError
 from edge.perception.record_fields import FIELDS, MAPS, Field, Out
 from edge.sinks.ros2.map_messages import UNITS, recorded_map
-from edge.sinks.ros2.messages import GRID, IMAGE, RESULT
+from edge.sinks.ros2.messages import GRID, RESULT
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.pad_geometry import AXES, SensorGeometry
+from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.poses import PoseTrack, TimedPose
 from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.csv_reader import CSV_POSES, EMULATED, csv_header
 from firmware_bridge.recording.mcap_records import DamageError, messages
-from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 from firmware_bridge.recording.scan_messages import BASELINE_NAME, SCAN_NAME, decode_baseline, decode_scan
-from firmware_bridge.recording.tracks import Track, mounting_text
+from firmware_bridge.recording.tracks import Recording, Track, mounting_text
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
 
+RESULTS_FORMAT: Final = "tactile-results"
 KINDS: Final[Mapping[str, tuple[str, Any]]] = {
     **{field.name: (field.kind.array, field.kind.unknown) for field in FIELDS if Out.NPZ in field.out},
     "origin": ("<U8", ""),
@@ -48,23 +48,23 @@ _ELSEWHERE: Final = {"scan_pose": ("pose",), "centre_of_pressure_mm": ("wrench",
 """Places in a record of arrays that have another name there."""
 
 
-def write_npz(
-    path: Path, rows: Iterable[Mapping[str, Any]], mountings: Mapping[str, Mounting], poses: Sequence[TimedPose]
-) -> None:
-    """Write a recording of rows, each the values of a scan by the names of KINDS; what a row lacks is unknown there.
+def write_npz(path: Path, recording: Recording) -> None:
+    """Write arrays with a row for each scan of an .mcap; what a row lacks is unknown there.
 
-    Raises a SinkError where patterns change their size.
+    Raises:
+        RecordingError: a result or a map cannot be read.
+        SinkError: patterns change their size.
     """
     with ExitStack() as opened:
         columns = _Columns(path.parent, opened)
-        for row in rows:
+        for row in _Rows(recording):
             columns.add(row)
-        texts = json.dumps({name: mounting_text(mounting) for name, mounting in mountings.items()})
+        texts = {name: mounting_text(mounting) for name, mounting in recording.mountings.items()}
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for name, value in (("format", NPZ_FORMAT), ("version", NPZ_VERSION), ("mountings", texts)):
-                _add(archive, name, np.asarray(value))
+            _add(archive, "format", np.asarray(RESULTS_FORMAT))
+            _add(archive, "mountings", np.asarray(json.dumps(texts)))
             columns.add_to(archive)
-            for name, array in _pose_arrays(poses).items():
+            for name, array in _pose_arrays(recording.poses).items():
                 _add(archive, name, array)
 
 
@@ -119,7 +119,6 @@ def _pose_arrays(poses: Sequence[TimedPose]) -> dict[str, NDArray[Any]]:
         "pose": np.array([astuple(pose.pose) for pose in poses], np.float64),
         "pose_sensor": np.array([pose.sensor or "" for pose in poses]),
         "pose_holds": np.array([pose.holds for pose in poses]),
-        "pose_used_from_ns": np.array([-1 if pose.used_from_ns is None else pose.used_from_ns for pose in poses]),
     }
 
 
@@ -127,17 +126,14 @@ class _Topic(NamedTuple):
     sensor: str
     name: str
     kind: MessageType
-    factor: float  # of a map to its unit
 
 
-class RecordedRows:
-    """Rows of a recording that `load_recording` has read, in the order of its messages.
+class _Rows:
+    """Rows of a recording, each the values of a scan by the names of KINDS, in the order of its messages."""
 
-    Going over them raises a RecordingError where a result or a map cannot be read.
-    """
-
-    def __init__(self, path: Path, geometry: SensorGeometry, origin: str) -> None:
-        self._path, self._geometry, self._origin = path, geometry, origin
+    def __init__(self, recording: Recording) -> None:
+        self._path, self._geometry = recording.path, recording.tracks[0].geometry
+        self._origin = recording.origin or "replay"
         self._baselines: dict[str, Baseline] = {}
         self._taps = 1
         self._of = ""
@@ -162,14 +158,12 @@ class RecordedRows:
             yield self._row
 
     def _topic_of(self, channel: Channel, schema: Schema | None) -> _Topic | None:
-        if schema is None or schema.name not in (SCAN_NAME, BASELINE_NAME, RESULT.name, GRID.name, IMAGE.name):
+        if schema is None or schema.name not in (SCAN_NAME, BASELINE_NAME, RESULT.name, GRID.name):
             return None
         sensor, _, name = channel.topic.rpartition("/")
-        # Earlier releases wrote maps in their own units, and stated none.
-        factor = UNITS[name].factor if name in UNITS and channel.metadata.get("unit") else 1.0
-        return _Topic(sensor, name, MessageType.of(schema.name, schema.data.decode()), factor)
+        return _Topic(sensor, name, MessageType.of(schema.name, schema.data.decode()))
 
-    def _read(self, topic: _Topic, log_ns: int, data: memoryview) -> None:
+    def _read(self, topic: _Topic, log_ns: int, data: bytes) -> None:
         if topic.kind.name == SCAN_NAME:
             self._of, self._row = topic.sensor, self._begun(data, log_ns)
         elif topic.kind.name == BASELINE_NAME:
@@ -182,9 +176,9 @@ class RecordedRows:
             fields = (field for field in _OF_RECORDS if field.name != "poses" or record.get("poses") is not None)
             self._row |= {field.name: _value(field, record, self._taps) for field in fields}
         elif topic.name in _MAP_NAMES:
-            self._row |= {topic.name: _map(topic, data), "has_pattern": True}
+            self._row |= {topic.name: recorded_map(data) / np.float32(UNITS[topic.name].factor), "has_pattern": True}
 
-    def _begun(self, data: memoryview, log_ns: int) -> dict[str, Any]:
+    def _begun(self, data: bytes, log_ns: int) -> dict[str, Any]:
         scan = decode_scan(data, self._geometry)
         row: dict[str, Any] = {
             "time_ns": scan.time_ns,
@@ -220,11 +214,6 @@ def _value(field: Field, record: Mapping[str, Any], taps: int) -> Any:
     return sum(1 << int(taxel) for taxel in value) if field.name == "dead" else value
 
 
-def _map(topic: _Topic, data: memoryview) -> NDArray[np.float32]:
-    values = recorded_map(topic.kind.name, data) / np.float32(topic.factor)
-    return values.reshape(3, -1, values.shape[-1]) if topic.name == "traction" else values  # rows of an Image
-
-
 def _flat(value: Any) -> list[float | None]:
     """Return the numbers of a value, in their order."""
     if isinstance(value, dict):
@@ -234,39 +223,30 @@ def _flat(value: Any) -> list[float | None]:
     return [value]
 
 
-def write_csv(
-    path: Path,
-    track: Track,
-    times_ns: NDArray[np.int64],
-    mounting: Mounting,
-    poses: Sequence[TimedPose],
-    *,
-    emulated: bool,
-) -> None:
+def write_csv(path: Path, recording: Recording, track: Track) -> None:
     """Write the scans of a sensor that have all readings, since a CSV has no cell for an absent one.
 
-    Args:
-        path: of the file.
-        track: scans of the sensor, each taxel in its place; written in the order of the id map, by the mounting.
-        times_ns: (n,) times of the scans since the first one, in [ns].
-        mounting: of the sensor.
-        poses: of the pad, on the same clock, in the order of the scans that they served first.
-        emulated: the sensor is emulated.
+    The taxels are in the order of the id map, by the sensor's mounting.
     """
     taxels = track.geometry.taxel_count
-    counts = track.counts.reshape(len(times_ns), len(AXES), taxels)[:, :, np.argsort(mounting.order)]
-    whole = (counts != ABSENT).all(axis=(1, 2))
+    times_ns = {each.sensor: each.time_ns for each in recording.tracks if each.time_ns is not None}
+    first_ns = min(int(times[0]) for times in times_ns.values())
+    mounting = recording.mountings.get(track.sensor, Mounting(taxel_count=taxels))
+    counts = track.counts.reshape(-1, len(AXES), taxels)[:, :, np.argsort(mounting.order)]
+    own = [pose for pose in recording.poses if pose.sensor == track.sensor]
+    poses = own or [pose for pose in recording.poses if pose.sensor is None]
     course, taken = PoseTrack(), 0
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        mark = (EMULATED,) if emulated else ()
+        mark = (EMULATED,) if recording.origin == "emulated" else ()
         writer.writerow(("time_s", *csv_header(taxels), *(CSV_POSES if poses else ()), *mark))
-        for row in np.flatnonzero(whole):
-            time_ns = int(times_ns[row])
+        for row in np.flatnonzero((counts != ABSENT).all(axis=(1, 2))):
+            time_ns = int(times_ns[track.sensor][row])
             while taken < len(poses) and (poses[taken].used_from_ns or poses[taken].time_ns) <= time_ns:
                 course.add(poses[taken].time_ns, poses[taken].pose, holds=poses[taken].holds)
                 taken += 1
             pose = course.at(time_ns)
             place = ("", "", "") if pose is None else (pose.x_mm, pose.y_mm, pose.turn_deg)
             readings = counts[row].T.ravel().tolist()
-            writer.writerow((f"{time_ns / 1e9:.6f}", *readings, *(place if poses else ()), *("1" for _ in mark)))
+            seconds = f"{(time_ns - first_ns) / 1e9:.6f}"
+            writer.writerow((seconds, *readings, *(place if poses else ()), *("1" for _ in mark)))

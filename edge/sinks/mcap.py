@@ -52,7 +52,7 @@ from firmware_bridge.recording.scan_messages import (
     encode_scan,
     scan_type,
 )
-from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA, mounting_text
+from firmware_bridge.recording.tracks import mounting_text
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.sensor_file.model import SensorFile
@@ -81,12 +81,12 @@ class McapScans:
         path: Path,
         sensors: SensorFile,
         offset_ns: int | None,
-        facts: Mapping[str, Mapping[str, str]] | None = None,
+        contract: dict[str, str],
     ) -> None:
         """Begin the file; one that exists is left alone.
 
-        Without the mountings of the sensors, axes would point elsewhere when the file is played again. The offset is 0
-        where the time of recording is unknown, and None for the clocks as they are now. `facts` are further metadata.
+        Without the mountings of the sensors, axes would point elsewhere when the file is played again. The offset is
+        None for the clocks as they are now. The contract is that of the model, as JSON by its keys.
 
         Raises:
             SinkError: the file exists, or cannot be written.
@@ -97,16 +97,13 @@ class McapScans:
         taxels = sensors.geometry.taxel_count
         self._scan, self._baseline = scan_type(taxels), baseline_type(taxels)
         self._facts = {
-            GEOMETRY_METADATA: {key: json.dumps(value) for key, value in asdict(sensors.geometry).items()},
+            "geometry": {key: json.dumps(value) for key, value in asdict(sensors.geometry).items()},
             "units": {name: unit.name for name, unit in UNITS.items()},
         }
-        self._mountings = {
-            name: {"sensor": name, "mounting": mounting_text(mounting)} for name, mounting in sensors.mountings.items()
-        }
+        self._mountings = {name: {"mounting": mounting_text(mounting)} for name, mounting in sensors.mountings.items()}
         self._frames = dict(sensors.frames)
         self._baselines: dict[str, Baseline | None] = {}
         self._repeat_ns: dict[str, int] = {}
-        self._source_told = False
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}  # as the public writer numbers them
         self._sequences: Counter[int] = Counter()
@@ -124,11 +121,8 @@ class McapScans:
             self._jobs: list[Callable[[], object]] = [start]
             self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="mcap-writer")
             try:
-                for name, fields in (facts or {}).items():
-                    self._add_metadata(name, fields)
-                self._add_metadata(GEOMETRY_METADATA, self._facts[GEOMETRY_METADATA])
-                for fields in self._mountings.values():
-                    self._add_metadata(MOUNTING_METADATA, fields)
+                self._jobs.append(partial(self._writer.add_metadata, "contract", contract))
+                self._hand_over()
             except BaseException:  # Ctrl-C, too: nothing else would end a thread that has just been started
                 self.abandon()
                 raise
@@ -142,16 +136,12 @@ class McapScans:
     ) -> None:
         """Add one scan of a kind of source with its frame_id; what it means, and a new baseline, come first."""
         sensor, unix_ns = scan.sensor, scan.time_ns + self.offset_ns
-        source = {"kind": kind}
-        if not self._source_told:
-            self._add_metadata(SOURCE_METADATA, source)
-            self._source_told = True
         repeat = unix_ns >= self._repeat_ns.get(sensor, 0)  # once a second, so that a part of a file has them, too
         if repeat:
             self._repeat_ns[sensor] = unix_ns + NS_PER_S
-            facts = self._facts | {SOURCE_METADATA: source}
+            facts = self._facts | {"source": {"kind": kind}}
             if sensor in self._mountings:
-                facts[MOUNTING_METADATA] = self._mountings[sensor]
+                facts["mounting"] = self._mountings[sensor]
             header = {"stamp": stamp(unix_ns), "frame_id": frame}
             data = SENSOR.encode({"header": header, "sensor": sensor, "facts": json.dumps(facts)})
             self.add(sensor, "sensor", SENSOR, unix_ns, data)
@@ -244,11 +234,6 @@ class McapScans:
     def flush(self) -> None:
         """Do nothing: `_run` puts the bytes on the disk."""
 
-    def _add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add facts that hold for the whole file, and pass them to the writing thread at once."""
-        self._jobs.append(partial(self._writer.add_metadata, name, dict(values)))
-        self._hand_over()
-
     def _hand_over(self) -> None:
         """Pass what was added to the writing thread, which works in order and writes nothing more after a failure."""
         self._look_back()
@@ -303,8 +288,8 @@ class McapSink(Sink):
         self._turns = CountersInTurn()
         self.unwritten = 0
         self._failed = False
-        facts = {"contract": {key: json.dumps(value) for key, value in asdict(contract).items()}}
-        self._file = McapScans(path, source.sensor_file, source.unix_offset_ns, facts)
+        text = {key: json.dumps(value) for key, value in asdict(contract).items()}
+        self._file = McapScans(path, source.sensor_file, source.unix_offset_ns, text)
 
     @property
     def scans(self) -> int:

@@ -40,7 +40,7 @@ class Robot:
         self.steered = False
         self.stated: deque[TimedPose] = deque()
         self._options = options
-        rate_hz = recording.rate_hz or 0.0
+        rate_hz = recording.rate_hz or recording.tracks[0].mean_rate_hz or 0.0
         self._poses: dict[int, _Stated] = {
             round(pose.time_ns * rate_hz / 1e9): (pose.pose, pose.holds) for pose in recording.poses if rate_hz
         }

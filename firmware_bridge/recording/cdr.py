@@ -74,7 +74,7 @@ class MessageType:
         self._write(out, values)
         return HEADER + out
 
-    def decode(self, data: bytes | memoryview) -> dict[str, Any]:
+    def decode(self, data: bytes) -> dict[str, Any]:
         """Decode the fields of a message; arrays of numbers as flat read-only arrays.
 
         Raises:

@@ -30,11 +30,8 @@ from firmware_bridge.recording.scan_messages import (
     scan_type,
 )
 from firmware_bridge.recording.tracks import (
-    GEOMETRY_METADATA,
     MOST_POSES,
     MOST_SENSORS,
-    MOUNTING_METADATA,
-    SOURCE_METADATA,
     Recording,
     Track,
     origin_of,
@@ -46,7 +43,6 @@ from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
 
 MOST_KEPT_BYTES: Final = 1 << 31  # most bytes of the scans in memory: a day of one sensor at 100 Hz
-MOST_SHOWN_TOPICS: Final = 10
 
 
 @dataclass
@@ -86,9 +82,7 @@ def load_mcap(path: Path) -> Recording:
     with path.open("rb") as file:
         try:
             for record in messages(file, reading.topic_of):
-                if isinstance(record, Metadata):
-                    reading.take_metadata(record.name, record.metadata)
-                else:
+                if not isinstance(record, Metadata):
                     reading.take_message(*record)
         except CutOffError as end:
             reading.notes.insert(0, f"{path} breaks off ({end}): its recording was killed, or the disk was full")
@@ -104,12 +98,10 @@ class _Reading:
     def __init__(self, path: Path) -> None:
         self.notes: list[str] = []
         self._path = path
-        self._topics: dict[int, str] = {}
         self._sensors: dict[str, _Sensor] = {}  # those with scans in the order of the first ones
         self._geometry = USPA44  # for files that name no geometry
-        self._named = False  # whether metadata or a message names it
+        self._named = False  # whether a message names it
         self._sized = False  # whether a message's definition holds its number of taxels
-        self._described = False  # whether there are metadata
         self._offset_ns: int | None = None
         self._kept_bytes = 0
         self._poses: list[TimedPose] = []
@@ -117,20 +109,19 @@ class _Reading:
 
     def topic_of(self, channel: Channel, schema: Schema | None) -> tuple[str, MessageType] | None:
         """Return the name of a topic and the type of its messages, None for one that is not of edge-sr."""
-        self._topics[channel.id] = name = channel.topic[:60]
         kind = None if schema is None or channel.message_encoding != "cdr" else self._kind_of(schema)
-        return kind and (name, kind)
+        return kind and (channel.topic[:60], kind)
 
     def recording(self) -> Recording:
         """Return what was read; a RecordingError without scans."""
         scanned = {name: entry for name, entry in self._sensors.items() if entry.times_ns}
         if not scanned:
-            self._refuse(f"no scans that edge-sr recorded{self._instead()}")
-        bare = [] if self._described else sorted(name for name, entry in scanned.items() if entry.facts is None)
+            self._refuse("; ".join(["no scans that edge-sr recorded", *self.notes]))
+        bare = sorted(name for name, entry in scanned.items() if entry.facts is None)
         if bare:
             self.notes.append(
                 f"{self._path}: the mounting of sensor {', '.join(bare)} is not in the file, as after a tool that "
-                "copies a part of it: its axes and gains are those of the id map, unless --sensor FILE gives others"
+                "copies a part of it: its axes are those of the id map, unless --sensor FILE gives others"
             )
         return Recording(
             self._path,
@@ -164,27 +155,6 @@ class _Reading:
         self._sized = self._sized or schema.name in (SCAN_NAME, BASELINE_NAME)
         return wanted
 
-    def take_metadata(self, name: str, fields: Mapping[str, str]) -> None:
-        """Process a record of metadata."""
-        self._described = True
-        self._take_named(name, fields)
-
-    def _take_named(self, name: str, fields: Mapping[str, str]) -> None:
-        if name == SOURCE_METADATA:
-            self._origin = origin_of({fields.get("kind", ""), self._origin or ""} - {""})
-        elif name == GEOMETRY_METADATA:
-            self._take_geometry(fields)
-        elif name == MOUNTING_METADATA:
-            sensor = fields.get("sensor", "")
-            try:
-                mounting = read_mounting(fields.get("mounting", ""), self._geometry.taxel_count)
-            except ValueError as error:
-                self._refuse(f"no mounting of sensor {sensor[:20]!r}: {short(error)}")
-            entry = self._sensor(sensor)
-            if entry.mounting not in (None, mounting):
-                self._refuse(f"two mountings of sensor {sensor[:20]!r}, expected one: cut it in parts")
-            entry.mounting = mounting
-
     def _take_geometry(self, fields: Mapping[str, str]) -> None:
         try:
             geometry = SensorGeometry(**{key: json.loads(text) for key, text in fields.items()})
@@ -199,22 +169,39 @@ class _Reading:
             self._refuse(f"no geometry of its sensors: {short(error)}")
         self._geometry, self._named = geometry, True
 
-    def _take_facts(self, data: memoryview) -> None:
+    def _take_mounting(self, sensor: str, entry: _Sensor, text: str) -> None:
+        try:
+            mounting = read_mounting(text, self._geometry.taxel_count)
+        except ValueError as error:
+            self._refuse(f"no mounting of sensor {sensor[:20]!r}: {short(error)}")
+        if entry.mounting not in (None, mounting):
+            self._refuse(f"two mountings of sensor {sensor[:20]!r}, expected one: cut it in parts")
+        entry.mounting = mounting
+
+    def _take_facts(self, data: bytes) -> None:
         fields = SENSOR.decode(data)
         sensor, text = fields["sensor"], fields["facts"]
         entry = self._sensor(sensor)
         if entry.facts == text:
             return
         try:
-            for name, values in json.loads(text).items():
-                self._take_named(name, {str(key): str(value) for key, value in values.items()})
+            facts = {
+                name: {str(key): str(value) for key, value in values.items()}
+                for name, values in json.loads(text).items()
+            }
+            if "source" in facts:
+                self._origin = origin_of({facts["source"].get("kind", ""), self._origin or ""} - {""})
+            if "geometry" in facts:
+                self._take_geometry(facts["geometry"])
+            if "mounting" in facts:
+                self._take_mounting(sensor, entry, facts["mounting"].get("mounting", ""))
         except RecordingError:
             raise
         except (ValueError, AttributeError, RecursionError) as error:
             raise CdrError(f"facts of sensor {sensor[:20]!r} that cannot be read: {short(error)}") from error
         entry.facts = text
 
-    def take_message(self, topic: tuple[str, MessageType], log_ns: int, data: memoryview) -> None:
+    def take_message(self, topic: tuple[str, MessageType], log_ns: int, data: bytes) -> None:
         """Process a message of a topic, logged at a time in [ns] since 1970."""
         name, kind = topic
         try:
@@ -273,15 +260,6 @@ class _Reading:
                 f"{self._path}: sensor {baseline.sensor} was zeroed again while it was recorded ({before.id}, then "
                 f"{baseline.id}); played again it keeps to the baseline of its beginning"
             )
-
-    def _instead(self) -> str:
-        if self.notes:
-            return f"; {self.notes[0]}"
-        names = list(self._topics.values())
-        if not names:
-            return ", and no topics"
-        more = f", and {len(names) - MOST_SHOWN_TOPICS} more" if len(names) > MOST_SHOWN_TOPICS else ""
-        return f"; its topics are {', '.join(map(repr, names[:MOST_SHOWN_TOPICS]))}{more}"
 
     def _refuse(self, why: str) -> NoReturn:
         raise RecordingError(f"{self._path}: {why}")

@@ -1,16 +1,14 @@
-"""Recordings as npz: arrays with a row for each scan, as `edge-sr convert` and earlier releases write them.
+"""Recordings as npz, as other programs make them: arrays of raw counts with a row for each scan, and poses.
 
 Nothing is unpickled, and no memory is allocated by an unchecked header.
 """
 
 import io
-import json
-import math
 import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from math import prod
 from pathlib import Path
 from tokenize import TokenError
@@ -24,7 +22,6 @@ from firmware_bridge.errors import CdrError, NpzError, RecordingError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
 from firmware_bridge.poses import POSE_FIELDS, TimedPose
 from firmware_bridge.recording.tracks import (
-    A_RATE,
     HIGHEST_COUNT,
     MOST_POSES,
     MOST_SENSORS,
@@ -32,14 +29,10 @@ from firmware_bridge.recording.tracks import (
     Track,
     check_raw,
     checked_pose,
-    is_rate,
     origin_of,
-    read_mounting,
 )
-from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
-from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
-from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline
+from firmware_bridge.schedule import LAST_TIME_NS
 
 LONGEST_READ_BYTES: Final = 1 << 20
 """Most bytes of one read: zipfile reads a table of contents in one piece, whose members could take gigabytes."""
@@ -115,12 +108,11 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
 NPZ_FORMAT: Final = "tactile-recording"
 NPZ_VERSION: Final = 1
 MOST_NPZ_BYTES: Final = 1 << 31  # most bytes of the arrays that are read: a day of one sensor at 100 Hz
-_SCANS: Final = {"sensor": "U", "time_ns": "iu", "counts": "iu", "origin": "U", "source": "U"}  # older: no `origin`
-_BASELINES: Final = {"baseline": "U", "baseline_counts": "f", "baseline_age_s": "f"}
-_POSES: Final = {"pose_time_ns": "iu", "pose": "fiu", "pose_sensor": "U", "pose_holds": "b", "pose_used_from_ns": "iu"}
+_SCANS: Final = {"sensor": "U", "time_ns": "iu", "counts": "iu", "origin": "U"}
+_POSES: Final = {"pose_time_ns": "iu", "pose": "fiu", "pose_sensor": "U", "pose_holds": "b"}
 """Arrays with a row for each scan, the last for each pose, and their kinds of numpy."""
 _REQUIRED: Final = ("format", "version", "sensor", "time_ns", "counts")
-_KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "f": "real numbers", "fiu": "numbers"}
+_KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "fiu": "numbers"}
 
 
 def load_npz(path: Path) -> Recording:
@@ -132,37 +124,27 @@ def load_npz(path: Path) -> Recording:
 
 
 def _recording(path: Path) -> Recording:
-    arrays = read_npz(path, (*_REQUIRED, *_SCANS, *_BASELINES, *_POSES, "rate_hz", "mountings"), MOST_NPZ_BYTES)
+    arrays = read_npz(path, (*_REQUIRED, *_SCANS, *_POSES), MOST_NPZ_BYTES)
+    if str(arrays.get("format", "missing")) != NPZ_FORMAT:
+        got = repr(str(arrays.get("format", "missing"))[:40])
+        _refuse("format", got, f"'{NPZ_FORMAT}'; of a converted file play the .mcap")
     for name in _REQUIRED:
         if name not in arrays:
-            raise NpzError(f"array '{name}': missing, expected what `edge-sr convert` writes")
-    form, version, counts = arrays["format"], arrays["version"], arrays["counts"]
-    if str(form) != NPZ_FORMAT:
-        _refuse("format", repr(str(form)[:40]), f"'{NPZ_FORMAT}'")
+            raise NpzError(f"array '{name}': missing, expected it beside {', '.join(_REQUIRED)}")
+    version, counts = arrays["version"], arrays["counts"]
     if version.shape or version.dtype.kind not in "iu" or int(version) != NPZ_VERSION:
         _refuse("version", str(version)[:40], f"{NPZ_VERSION}")
     grid = counts.shape[1:]
     if len(grid) != 3 or grid[0] != len(AXES) or not 0 < grid[1] * grid[2] <= MOST_TAXELS or not counts.size:
         expected = f"(scans, {len(AXES)}, rows, cols), {MOST_TAXELS} taxels at most, at least one scan"
         _refuse("counts", f"shape {counts.shape}", expected)
-    _check_arrays(arrays, _SCANS | _BASELINES, len(counts), counts=grid, baseline_counts=grid)
+    _check_arrays(arrays, _SCANS, len(counts), counts=grid)
     if counts.min() < ABSENT or counts.max() > HIGHEST_COUNT:
         got = f"counts {counts.min()}..{counts.max()}"
         _refuse("counts", got, f"0..{HIGHEST_COUNT}, or {ABSENT} where a taxel is absent")
     check_raw(f"{path}: array 'counts'", counts)
-    rate, origin = arrays.get("rate_hz"), arrays.get("origin", arrays.get("source", np.empty(0)))
-    if rate is not None and (rate.shape or rate.dtype.kind not in "iuf" or not is_rate(float(rate))):
-        _refuse("rate_hz", str(rate)[:40], A_RATE)
-    tracks = tuple(_tracks(arrays))
-    return Recording(
-        path,
-        tracks,
-        None if rate is None else float(rate),
-        _baselines(arrays, tracks),
-        _mountings(str(arrays.get("mountings", "{}")), tracks),
-        origin=origin_of(np.unique(origin).tolist()),
-        poses=_poses(arrays),
-    )
+    origin = origin_of(np.unique(arrays.get("origin", np.empty(0))).tolist())
+    return Recording(path, tuple(_tracks(arrays)), None, origin=origin, poses=_poses(arrays))
 
 
 def _tracks(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Track]:
@@ -181,33 +163,6 @@ def _tracks(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Track]:
         yield Track(name, arrays["counts"][sensors == name].astype(np.int32), times.astype(np.int64))
 
 
-def _baselines(arrays: Mapping[str, NDArray[Any]], tracks: Sequence[Track]) -> dict[str, Baseline]:
-    """Return the baselines of the first scan of each sensor, dated by the clock of the scans."""
-    baselines: dict[str, Baseline] = {}
-    for track in tracks if arrays.keys() >= _BASELINES.keys() else ():
-        first = int(np.argmax(arrays["sensor"] == track.sensor))
-        text, age_s = str(arrays["baseline"][first]), float(arrays["baseline_age_s"][first])
-        own = arrays["baseline_counts"][first].astype(np.float32)
-        if not text or track.time_ns is None:
-            continue
-        in_range = np.isnan(own) | ((own >= 0) & (own <= HIGHEST_COUNT + 1))
-        if not in_range.all() or not is_sensor_name(text):
-            _refuse("baseline_counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
-        own.setflags(write=False)
-        taken_s = int(track.time_ns[0]) / NS_PER_S - (age_s if 0 <= age_s <= LAST_UNIX_S else math.nan)
-        baselines[track.sensor] = Baseline(track.sensor, own, taken_s, 1, "file", text)
-    return baselines
-
-
-def _mountings(text: str, tracks: Sequence[Track]) -> dict[str, Mounting]:
-    try:
-        texts = json.loads(text)
-        taxels = {track.sensor: track.counts[0, 0].size for track in tracks}
-        return {sensor: read_mounting(texts[sensor], count) for sensor, count in taxels.items() if sensor in texts}
-    except (ValueError, TypeError, RecursionError) as error:
-        _refuse("mountings", " ".join(str(error).split())[:120], "JSON as `edge-sr convert` writes it")
-
-
 def _poses(arrays: Mapping[str, NDArray[Any]]) -> list[TimedPose]:
     """Return the poses; other programs may leave out all but their times and numbers."""
     names = [name for name in _POSES if name in arrays]
@@ -224,10 +179,12 @@ def _poses(arrays: Mapping[str, NDArray[Any]]) -> list[TimedPose]:
     if len(np.unique(sensors)) > MOST_SENSORS + 1:
         _refuse("pose_sensor", f"{len(np.unique(sensors))} sensors", f"at most {MOST_SENSORS}")
     holds = arrays.get("pose_holds", np.zeros(count, bool))
-    used_from_ns = arrays.get("pose_used_from_ns", np.full(count, -1))
-    rows = (arrays["pose"].astype(np.float64), arrays["pose_time_ns"], holds, used_from_ns, sensors)
+    rows = (arrays["pose"].astype(np.float64), arrays["pose_time_ns"], holds, sensors)
     try:
-        return list(map(checked_pose, *(each.tolist() for each in rows)))
+        return [
+            checked_pose(numbers, time_ns, rests, -1, sensor)
+            for numbers, time_ns, rests, sensor in zip(*(array.tolist() for array in rows), strict=True)
+        ]
     except CdrError as error:
         raise NpzError(f"array 'pose': {error}") from error
 

@@ -52,7 +52,7 @@ _SENSOR_TEXT: Final = """\
 # What the scans of a sensor mean, repeated, since tools copy messages alone, or those from some time on.
 std_msgs/Header header
 string sensor
-string facts                    # JSON: by name, what the file's metadata records hold as well, and units
+string facts                    # JSON: geometry of the pad, kind of source, mounting, and units of the maps
 """
 _POSE_TEXT: Final = """\
 # Pose of a pad in the plane of the object that it touches: x to the right, y down, a turn from x to y.
@@ -120,7 +120,7 @@ def encode_scan(scan: Scan, frame: str, unix_ns: int, fresh: int, renewed: int) 
     )
 
 
-def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> RecordedScan:
+def decode_scan(data: bytes, geometry: SensorGeometry = USPA44) -> RecordedScan:
     """Decode the scan in a message."""
     fields = scan_type(geometry.taxel_count).decode(data)
     sensor, fresh, renewed = fields["sensor"], fields["fresh"], fields["renewed"]
@@ -170,7 +170,7 @@ def encode_baseline(baseline: Baseline, frame: str, age_s: float | None, unix_ns
     )
 
 
-def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> Baseline:
+def decode_baseline(data: bytes, geometry: SensorGeometry = USPA44) -> Baseline:
     """Decode the baseline in a message, with the origin that it had in the recorded run."""
     fields = baseline_type(geometry.taxel_count).decode(data)
     sensor, created_unix_s, scans = fields["sensor"], fields["created_unix_s"], fields["scans"]
@@ -204,7 +204,7 @@ def encode_pose(timed: TimedPose, unix_ns: int) -> bytes:
     )
 
 
-def decode_pose(data: bytes | memoryview) -> TimedPose:
+def decode_pose(data: bytes) -> TimedPose:
     """Decode the pose in a message."""
     fields = POSE.decode(data)
     numbers = [fields[name] for name in POSE_FIELDS]

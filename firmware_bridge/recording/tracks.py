@@ -19,9 +19,6 @@ from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 if TYPE_CHECKING:
     from firmware_bridge.zeroing.baseline import Baseline
 
-GEOMETRY_METADATA: Final = "geometry"  # name of the MCAP metadata that holds the pad of all sensors
-MOUNTING_METADATA: Final = "mounting"  # name of the MCAP metadata that hold the mounting of a sensor each
-SOURCE_METADATA: Final = "source"  # name of the MCAP metadata that holds the kind of source
 HIGHEST_COUNT: Final = 0xFFFF
 MOST_SENSORS: Final = 64  # most sensors of a recording; one wire can have sixteen
 MOST_POSES: Final = 1 << 23  # most poses of a recording: those of a day at 100 Hz, in 3 GB
@@ -134,10 +131,10 @@ def read_mounting(text: str, taxel_count: int) -> Mounting:
     """
     try:
         fields = json.loads(text)
-        order, signs, gains = (tuple(fields[key]) for key in ("order", "signs", "gains"))
+        order, signs = tuple(fields["order"]), tuple(fields["signs"])
         if not all(type(value) is int for value in (*order, *signs)) or type(fields["swap_xy"]) is not bool:
             raise ValueError("not whole numbers")
-        return Mounting(order, fields["swap_xy"], signs, tuple(map(float, gains)), taxel_count)
+        return Mounting(order, fields["swap_xy"], signs, taxel_count)
     except (TypeError, KeyError, RecursionError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from error
 

@@ -1,13 +1,12 @@
 """Mounting of a sensor where it is used: the places of its taxels, and the directions of its axes.
 
-Raw counts are put in their place when a scan is made, and stay raw; axes are turned, and gains evened out, when
-counts become deformation. So a recording holds the raw counts of the chips, each at the place of its taxel. Forces
-from the vendor's software are never zeroed: their axes are turned at once.
+Raw counts are put in their place when a scan is made, and stay raw; axes are turned when counts become deformation. So
+a recording holds the raw counts of the chips, each at the place of its taxel. Forces from the vendor's software are
+never zeroed: their axes are turned at once.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from types import MappingProxyType
 from typing import Final
 
@@ -25,13 +24,12 @@ AS_MAPPED: Final = tuple(range(USPA44.taxel_count))  # default order of the defa
 class Mounting:
     """Mounting of one sensor; by default that of its id map.
 
-    An order that is left out or empty is that of the id map; gains that are left out or empty are 1.
+    An order that is left out or empty is that of the id map.
 
     Attributes:
         order: for each place on the pad, row-major from the top left, the taxel of the id map that lies there.
         swap_xy: True where the wire's x is the pad's y, and the other way round.
         signs: 1 or -1 for x (to the right), y (down) and z (into the pad), after the swap.
-        gains: factors on x, y and z of every place, axis by axis, after the swap; 3 * taxels numbers.
         taxel_count: number of taxels of the sensor.
 
     Raises:
@@ -41,19 +39,15 @@ class Mounting:
     order: tuple[int, ...] = ()
     swap_xy: bool = False
     signs: tuple[int, int, int] = (1, 1, 1)
-    gains: tuple[float, ...] = ()
     taxel_count: int = USPA44.taxel_count
 
     def __post_init__(self) -> None:
         count = self.taxel_count
         object.__setattr__(self, "order", self.order or tuple(range(count)))
-        object.__setattr__(self, "gains", self.gains or (1.0,) * (len(AXES) * count))
         if sorted(self.order) != list(range(count)):
             raise ValueError(f"order is {list(self.order)}, expected each of 0..{count - 1} once")
         if len(self.signs) != len(AXES) or not set(self.signs) <= {1, -1}:
             raise ValueError(f"signs are {list(self.signs)}, expected three of 1 and -1")
-        if len(self.gains) != len(AXES) * count or not all(0 < gain < np.inf for gain in self.gains):
-            raise ValueError(f"gains are {list(self.gains)}, expected {len(AXES) * count} positive numbers")
 
     @property
     def moves_taxels(self) -> bool:
@@ -61,19 +55,14 @@ class Mounting:
         return self.order != tuple(range(self.taxel_count))
 
     @property
-    def reverses_axes(self) -> bool:
+    def turns_axes(self) -> bool:
         """True if the pad's axes differ from the wire's, or point the other way."""
         return self.swap_xy or self.signs != (1, 1, 1)
-
-    @property
-    def turns_axes(self) -> bool:
-        """True if counts become deformation by more than the baseline: turned axes or gains."""
-        return self.reverses_axes or any(gain != 1 for gain in self.gains)
 
     def correct(self, deformation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Turn deformation (3, rows, cols), in place but along the wire's axes, to the pad's axes, in [counts]."""
         turned = deformation[[1, 0, 2]] if self.swap_xy else deformation.copy()
-        turned *= self._factors.reshape(turned.shape)
+        turned *= np.asarray(self.signs, dtype=np.float32)[:, None, None]
         return turned
 
     def place_counts(self, counts: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -99,13 +88,10 @@ class Mounting:
         order = np.asarray(self.order)[list(correction.order)]
         swap = [1, 0, 2] if correction.swap_xy else [0, 1, 2]
         signs = [self.signs[axis] * sign for axis, sign in zip(swap, correction.signs, strict=True)]
-        gains = np.asarray(self.gains).reshape(len(AXES), -1)[swap][:, list(correction.order)]
-        gains *= np.asarray(correction.gains).reshape(len(AXES), -1)
         return Mounting(
             tuple(order.tolist()),
             self.swap_xy != correction.swap_xy,
             (signs[0], signs[1], signs[2]),
-            tuple(gains.ravel().tolist()),
             self.taxel_count,
         )
 
@@ -121,11 +107,6 @@ class Mounting:
             for array in (vendor.temperature_k, vendor.ups_hz)
         )
         return VendorReading(newtons, temperature_k, ups_hz)
-
-    @cached_property
-    def _factors(self) -> NDArray[np.float32]:
-        gains = np.asarray(self.gains, dtype=np.float32).reshape(len(AXES), -1)
-        return gains * np.asarray(self.signs, dtype=np.float32)[:, None]
 
 
 def placed_map(model: ModelMap, mountings: Mapping[str, Mounting], prefix: str = "") -> ModelMap:

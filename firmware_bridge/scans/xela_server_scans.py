@@ -126,7 +126,7 @@ class _ServerSensor:
     """Readings of one sensor, and the taxels renewed since its last scan."""
 
     def __init__(self, name: str, geometry: SensorGeometry, mounting: Mounting | None) -> None:
-        self._mounting = mounting if mounting and (mounting.moves_taxels or mounting.reverses_axes) else None
+        self._mounting = mounting if mounting and (mounting.moves_taxels or mounting.turns_axes) else None
         self.counted: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
         self._geometry = geometry
         self._series = ScanSeries(name, geometry)

@@ -18,7 +18,6 @@ from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAIN_RANGE, PAD_RANGES, Pad
 from firmware_bridge.scans.scan import LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.strict_table import (
-    LEAST_POSITIVE,
     Table,
     a_table,
     between,
@@ -213,7 +212,6 @@ def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
         "order": cells(grid, lambda all_: set(map(type, all_)) == {int} and sorted(all_) == taxels, places),
         "swap_xy": truth,
         "signs": cells((len(AXES),), _are_signs, "1 or -1 for each of x, y, z"),
-        "gains": partial(_gains, geometry),
         "counts_per_newton": between(*PAD_RANGES["counts_per_newton"]),
         "counts_per_newton_interval": partial(_interval, *PAD_RANGES["counts_per_newton"]),
         **dict.fromkeys(("assumed", "emulated"), _marks),
@@ -223,7 +221,7 @@ def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
     table.end()
     values = {key: value for key, value in taken.items() if value is not None}
     _check_around(table, "counts_per_newton", values, values.get("counts_per_newton_interval"))
-    mounting = {key: values.pop(key) for key in ("order", "swap_xy", "signs", "gains") if key in values}
+    mounting = {key: values.pop(key) for key in ("order", "swap_xy", "signs") if key in values}
     for key, read in parts.items():
         if key in values:
             values[key] = read(table.part(key, values[key]), name, geometry)
@@ -297,14 +295,6 @@ def _marks(value: Any) -> frozenset[str]:
 
 def _are_signs(signs: list[Any]) -> bool:
     return all(type(sign) is int and sign in (1, -1) for sign in signs)
-
-
-def _gains(geometry: SensorGeometry, value: Any) -> tuple[float, ...]:
-    expected = f"positive numbers, 3, or {len(AXES)} x {geometry.rows} x {geometry.cols}"
-    per_taxel = isinstance(value, list) and any(isinstance(part, list) for part in value)
-    shape = geometry.scan_shape if per_taxel else (len(AXES),)
-    gains = numbers(shape, expected, low=LEAST_POSITIVE)(value)
-    return gains if per_taxel else tuple(gain for gain in gains for _ in range(geometry.taxel_count))
 
 
 def _interval(low: float, high: float, value: Any) -> tuple[float, ...]:

@@ -4,9 +4,8 @@ import fcntl
 import json
 import math
 import os
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,7 +26,6 @@ from firmware_bridge.sensor_file.model import (
 )
 
 _EMULATED: Final = "measured on an emulated sensor: not for a device"
-LOCKED_S: Final = 5.0  # longest wait for another program that changes the file, in [s]: changing it takes milliseconds
 
 
 @contextmanager
@@ -36,9 +34,6 @@ def changing(path: str | Path) -> Iterator[None]:
 
     The lock is on the folder, since the file is replaced by a new one each time, and goes with the program. Where a
     file system has no locks, none is taken.
-
-    Raises:
-        SensorFileError: another program holds the lock for too long.
     """
     try:
         folder = os.open(Path(path).parent, os.O_RDONLY)
@@ -46,17 +41,8 @@ def changing(path: str | Path) -> Iterator[None]:
         yield
         return
     try:
-        end_s = time.monotonic() + LOCKED_S
-        while True:
-            try:
-                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError as error:
-                if time.monotonic() >= end_s:
-                    raise SensorFileError(f"{path}: another program has kept it locked for {LOCKED_S:g} s") from error
-                time.sleep(0.01)
-            except OSError:
-                break
+        with suppress(OSError):
+            fcntl.flock(folder, fcntl.LOCK_EX)
         yield
     finally:
         os.close(folder)
@@ -109,14 +95,11 @@ def _text(sensor_file: SensorFile) -> str:
 def _tables(entry: SensorEntry, shape: tuple[int, int, int]) -> dict[str, list[str]]:
     """Return the lines of an entry's tables, by what follows the sensor's name in theirs."""
     mounting, frame, baseline = entry.mounting, entry.frame, entry.baseline
-    gains = np.reshape(mounting.gains, shape)
-    alike = bool((gains == gains[:, :1, :1]).all())
     own = [
         "# Which taxel of the model's map lies at each place, seen from above, as patterns are drawn.",
         *_line("order", np.reshape(mounting.order, shape[1:]).tolist()),
         *_line("swap_xy", mounting.swap_xy),
         *_line("signs", mounting.signs, "of x (to the right), y (down) and z (into the pad), after the swap"),
-        *_line("gains", gains[:, 0, 0].tolist() if alike else gains.tolist(), "of x, y and z"),
         *_line("counts_per_newton", entry.counts_per_newton, "of the summed z"),
         *_line("counts_per_newton_interval", entry.counts_per_newton_interval, "90 %"),
         *_line("assumed", sorted(entry.assumed, key=PARTS.index) or None, "as wired; not measured"),

@@ -29,8 +29,6 @@ STILL_COUNTS: Final = 7.0
 STEP_COUNTS: Final = 15.0
 """Change of rest level over a contact above which it is reported: more than noise and the end of a recovery cause."""
 
-_ZEROED: Final = "since it was zeroed"
-
 
 @dataclass(frozen=True, slots=True)
 class Drift:
@@ -65,7 +63,7 @@ class DriftTracker:
         self._rate_per_s = np.zeros((len(AXES), 1, 1), dtype=np.float32)
         self._step: NDArray[np.float32] | None = None
         self._voters: NDArray[np.bool_] | None = None
-        self._cause = _ZEROED
+        self._untouched = True  # since zeroing
         self._event: str | None = None
         self._block: list[NDArray[np.int32]] = []
         self._last_ns = 0  # the first scan interrupts, which sets the other attributes
@@ -102,12 +100,7 @@ class DriftTracker:
         return event
 
     def _interrupt(self, scan: Scan, contact: bool, dead: NDArray[np.bool_]) -> bool:
-        if contact or self._contact:
-            self._cause = "after a contact"
-        elif dead is self._dead:
-            self._cause = "after a gap"
-        elif self._dead is not None:
-            self._cause = "after a taxel was out"
+        self._untouched = self._untouched and not contact and self._dead is None
         self._contact, self._dead = contact, dead
         self._live = ~(dead | self._unzeroed)
         self._begin_block(scan.time_ns)
@@ -162,7 +155,7 @@ class DriftTracker:
         last_step = self._step
         common, own = self._parts(step)
         stepped = np.abs(step).max() > STEP_COUNTS
-        if self._cause == _ZEROED and np.abs(common).max() <= COMMON_COUNTS and _alike(common, own):
+        if self._untouched and np.abs(common).max() <= COMMON_COUNTS and _alike(common, own):
             # Not touched since zeroing: the change of a pad that has warmed up or is held in another attitude.
             step, stepped = np.zeros_like(step), False
         elif not stepped:
@@ -187,7 +180,7 @@ class DriftTracker:
         # Ten counts are 0.01 N, nine times a block's highest noise.
         touched = (np.abs(own) > 10 + OWN_SHARE * np.abs(common)).any()
         if touched or np.abs(common).max() > COMMON_COUNTS:
-            self._cause = "after a touch too light for a tap"
+            self._untouched = False
             self._stop()
             return False
         most = np.float32(COMMON_PER_S * seconds)
@@ -223,7 +216,7 @@ class DriftTracker:
         where = "all taxels alike, as drift or another attitude" if alike else f"taxel {row * shown.shape[2] + col}"
         above = "above" if counts > 0 else "below"
         what = f"rest level {abs(counts):.0f} counts {above} the one before on {AXES[axis]} ({where})"
-        return f"{what} {self._cause}: free the pad and zero again"
+        return f"{what}: free the pad and zero again"
 
 
 def _alike(common: NDArray[np.float32], own: NDArray[np.float32]) -> bool:

@@ -160,14 +160,12 @@ CREEP = 0.5 * 0.05
     ("levels", "common", "own"),
     [
         # 20 counts a second of common drift.
-        ([of_z(25)] * 2, 10, 0),
         ([of_z(25)] * 3, 20, 0),
         ([of_z(25)] * 5, 25, 0),
         # What was followed of a touch is dropped.
         ([of_z(6), of_z(6, own=200), *[of_z()] * 6], 0, 0),
         # By hand: of 20 counts/s a quarter of the way each half second, less the noise, times the share, and the creep.
         ([of_z(own=9), of_z(10, own=9)], 0, CREEP),
-        ([of_z(own=9), of_z(10, own=9), of_z(20, own=9)], 10, CREEP + 0.5 * (0.65 * 4.8 + 0.05)),
         (
             [of_z(own=9), of_z(10, own=9), *[of_z(20, own=9)] * 2],
             20,
@@ -193,31 +191,12 @@ def test_what_is_followed_at_rest(sign, levels, common, own):
         (of_z(own=11), False),
         (of_z(-20, own=22), True),
         (of_z(-20, own=24), False),
-        (of_z(4, own=12), True),
-        (of_z(4, own=13), False),
     ],
 )
 def test_what_is_ahead_is_followed_up_to_a_touch(ahead, followed):
     pad = resting()
     assert pad.block(ahead) is followed
     assert pad.blocks(6) == ([True] * 6 if followed else [*SETTLED, True])
-
-
-def test_after_a_gap_the_rate_is_forgotten():
-    pad, level = resting(), of_z(20, own=9)
-    pad.blocks(4, level)
-    before = pad.z()
-    pad.push(level, after_ns=6_000_000_000)
-    pad.blocks(7, level)
-    assert pad.z() - before == pytest.approx(CREEP, abs=1e-4)
-
-
-def test_scans_closer_than_the_sample_period_are_left_out():
-    pad = Blocks()
-    for block in range(7):
-        answers = [pad.push(0 if number % 2 else 900, after_ns=12_500_000) for number in range(1, 42)]
-        assert answers == [False] * 40 + [block > 4]
-    assert not pad.tracker.counts.any() and pad.step == 0
 
 
 def test_scans_without_a_living_taxel_do_not_count():
@@ -237,8 +216,6 @@ def test_scans_without_a_living_taxel_do_not_count():
         (of_z(own=8), False),
         (of_z(10, own=13), True),
         (of_z(10, own=14), False),
-        (of_z(-2, own=8), True),
-        (of_z(-2, own=9), False),
     ],
 )
 def test_a_pad_is_still_while_blocks_differ_by_little(change, still):
@@ -267,7 +244,7 @@ def test_a_step_over_a_contact_is_kept_and_told_of(level, step, event):
     pad = resting()
     assert pad.touched(level) == [False] * 4 + [bool(event)]
     assert pad.step == step
-    told = f"rest level {event} after a contact: free the pad and zero again" if event else None
+    told = f"rest level {event}: free the pad and zero again" if event else None
     assert pad.tracker.note == told and pad.event == (told or "") and not pad.event
     before = pad.tracker.counts
     pad.blocks(4, level)
@@ -283,7 +260,6 @@ def test_a_step_over_a_contact_is_kept_and_told_of(level, step, event):
         (of_z(51), 51),
         (of_z(8, own=12), 0),
         (of_z(8, own=13), 21),
-        (of_z(7, own=11), 18),
         (on_axes(0, 0, 20) + 7 * of_z(own=1)[::-1], 0),
         (on_axes(0, 0, 20) + 8 * of_z(own=1)[::-1], 20),
     ],
@@ -292,7 +268,6 @@ def test_since_zeroing_a_pad_may_have_drifted_by_fifty_counts(level, kept):
     pad = Blocks()
     answers = pad.blocks(5, level)
     assert pad.step == kept and answers == [False] * 4 + [kept > 0]
-    assert kept == 0 or "since it was zeroed" in pad.event
 
 
 def test_a_known_step_is_told_of_again_where_it_has_changed():
@@ -308,24 +283,22 @@ def test_a_known_step_is_told_of_again_where_it_has_changed():
 
 
 @pytest.mark.parametrize(
-    ("how", "gap_ns", "cause"),
-    [
-        ("dead", BLOCK_PERIOD_NS, "after a taxel was out"),
-        ("away", 6_000_000_000, "after a gap"),
-        ("forgotten", BLOCK_PERIOD_NS, "after a gap"),
-        ("light", BLOCK_PERIOD_NS, "after a touch too light for a tap"),
-    ],
+    ("how", "gap_ns"),
+    [("dead", BLOCK_PERIOD_NS), ("away", 6_000_000_000), ("forgotten", BLOCK_PERIOD_NS), ("light", BLOCK_PERIOD_NS)],
 )
-def test_the_cause_of_a_step_is_told(how, gap_ns, cause):
+def test_after_any_interruption_a_step_is_told(how, gap_ns):
+    """Of all taxels alike, which is drift only while nothing has happened since zeroing."""
     pad = resting()
     if how == "dead":
         pad.dead = NONE_DEAD.copy()
     if how == "forgotten":
         pad.tracker.forget()
-    if how != "light":
-        pad.push(of_z(own=-200), after_ns=gap_ns)
-    pad.blocks(6, of_z(own=-200))
-    assert cause in pad.event and pad.step == -200
+    if how == "light":
+        pad.block(of_z(own=200))
+    else:
+        pad.push(of_z(-40), after_ns=gap_ns)
+    pad.blocks(6, of_z(-40))
+    assert "all taxels alike" in pad.event and pad.step == -40
 
 
 @pytest.mark.parametrize(("voting", "followed"), [((0, 0, 0, 4), True), ((0, 0, 0, 5), False)])

@@ -7,7 +7,6 @@ import resource
 import subprocess
 import time
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,14 +17,13 @@ from edge_samples import BASELINE, ROOT, fake_source, make_scan, write_model
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
-from mcap_samples import SURE, arrays_of, make_results, messages_of, odd_scans, record_into
+from mcap_samples import SURE, make_results, messages_of, odd_scans, record_into
 
 from edge.cli import main as cli
 from edge.doctor.examine import prepare
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import messages as ros_messages
 from edge.sinks.ros2.map_messages import in_si, recorded_map
-from edge.sinks.ros2.messages import GRID
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
@@ -84,10 +82,7 @@ def patterns(path):
     by_topic = messages_of(path)
     said = {at: ros_messages.RESULT.decode(data) for at, data in by_topic["/finger/result"]}
     made_for = {at: json.loads(one["record"])["reused_from"] is None for at, one in said.items()}
-    return {
-        said[at]["scan"]: (made_for[at], recorded_map(GRID.name, data).tobytes())
-        for at, data in by_topic["/finger/pattern"]
-    }
+    return {said[at]["scan"]: (made_for[at], recorded_map(data).tobytes()) for at, data in by_topic["/finger/pattern"]}
 
 
 class TestOffline:
@@ -109,8 +104,7 @@ class TestOffline:
         made_then = {scan: pattern for scan, (own, pattern) in patterns(made / "press.mcap").items() if own}
         assert made_then and made_then.items() <= {scan: one for scan, (_, one) in offline.items()}.items()
 
-    @pytest.mark.parametrize("suffix", ["mcap", "npz"])
-    def test_it_begins_with_the_baseline_of_its_first_scan(self, made, tmp_path, suffix):
+    def test_it_begins_with_the_baseline_of_its_first_scan(self, made, tmp_path):
         """The recording begins in contact: zeroed again, the press would be gone."""
         path = tmp_path / "press.mcap"
         scans = [make_scan(number, press_counts=3000, noise=1) for number in range(130)]
@@ -118,35 +112,16 @@ class TestOffline:
         for result in make_results(scans, unix_time_s=lambda: 1012.4):
             sink.write(result, {})
         sink.close()
-        if suffix == "npz":
-            arrays_of(path)
-            path = path.with_suffix(".npz")
-        for options, age_s in (((), 12.4), (("--paced", "--rate-hz", 2000), 12.4 if suffix == "npz" else None)):
+        for options in ((), ("--paced", "--rate-hz", 2000)):
             got = replayed(made, tmp_path / "a.jsonl", *options, file=path)
             assert {one["baseline"] for one in got} == {BASELINE.id}
             # Longer than that nobody believes a taxel that is pressed alone.
             assert {one["state"] for one in got[:18]} <= {"contact", "dropped"}
-            # Played at its pace it is of now, and so is its age, where the file holds its date.
-            assert got[0]["baseline_age_s"] > 1e9 if age_s is None else abs(got[0]["baseline_age_s"] - age_s) < 60
+            # Played at its pace it is of now, and so is its age.
+            age_s = got[0]["baseline_age_s"]
+            assert age_s > 1e9 if options else abs(age_s - 12.4) < 60
         got = replayed(made, tmp_path / "a.jsonl", "--zero", file=path)
         assert [one["state"] for one in got] == ["zeroing"] * 99 + ["idle"] * 31
-
-    @pytest.mark.parametrize("age_s", [3000.0, None])
-    def test_a_baseline_older_than_the_machine_stays_so(self, made, tmp_path, age_s):
-        """An npz holds its age, and its times are those since the machine was started."""
-        results = make_results([make_scan(number, press_counts=3000, noise=1) for number in range(5)])
-        aged = [replace(result, baseline_age_s=age_s) for result in results]
-        arrays = arrays_of(record_into(tmp_path / "press.mcap", aged))
-        path = tmp_path / "press.npz"
-        np.savez(path, **(arrays | {"baseline_age_s": np.full(5, np.nan if age_s is None else age_s)}))
-        assert age_s is None or load_recording(path).tracks[0].time_ns[-1] < age_s * 1e9
-        for generation in range(3):
-            again = tmp_path / f"{generation}.mcap"
-            got = replayed(made, tmp_path / f"{generation}.jsonl", "--sink", f"mcap:{again}", file=path)
-            assert [one["state"] for one in got] == ["contact"] * 5
-            ages_s = [one["baseline_age_s"] for one in got]
-            assert ages_s[0] == age_s and {one["baseline"] for one in got} == {BASELINE.id}
-            path = again
 
 
 class TestRecord:
@@ -170,7 +145,6 @@ class TestRecord:
         [
             ("taken", 5, "cannot record into taken: it is a directory"),
             ("x.csv", 2, ".csv cannot be recorded: edge-sr record x.mcap; afterwards edge-sr convert x.mcap x.csv"),
-            ("x.JSONL", 2, ".JSONL cannot be recorded"),
             ("old.mcap", 5, "exists: give another name"),
             ("none/x", 5, "No such file or directory"),
         ],
@@ -198,7 +172,7 @@ class TestRecord:
         assert [scan.number for scan in seen] == list(range(len(seen))) and len(seen) >= len(written)
         recording = load_recording(path)
         assert (recording.tracks[0].counts == np.stack([scan.counts for scan in seen])).all()
-        assert "breaks off (without an end" in recording.notes[0] or "within a record" in recording.notes[0]
+        assert f"{path} breaks off (after byte " in recording.notes[0]
 
     def test_of_a_full_disk_no_more_scans_are_claimed_than_are_sure(self, made, tmp_path):
         path = tmp_path / "full.mcap"
@@ -206,10 +180,9 @@ class TestRecord:
         assert code == 5 and f"recorded {path}: at most " in said
         assert f"recording into {path} stopped: File too large; its " in said.splitlines()[-1]
 
-    @pytest.mark.parametrize("room_bytes", [0, 100, 4000])
-    def test_a_disk_without_room_for_one_scan_leaves_no_file(self, made, tmp_path, room_bytes):
+    def test_a_disk_without_room_for_one_scan_leaves_no_file(self, made, tmp_path):
         path = tmp_path / "full.mcap"
-        code, said = recorded_within(room_bytes, path, *source_of(made, 60))
+        code, said = recorded_within(4000, path, *source_of(made, 60))
         assert code == 5 and "File too large" in said.splitlines()[-1] and not path.exists()
         assert "can be played" not in said and f"recorded {path}" not in said
 

@@ -168,9 +168,7 @@ class TestPad:
         [
             {"thickness_mm": 0.0},
             {"counts_per_newton": float("nan")},
-            {"intervals": {"thickness": (1, 2)}},
             {"intervals": {"thickness_mm": (5, 4)}},
-            {"gains": (1.0,) * 16},
             {"gains": (0.0,) * 48},
             {"gain_half_widths": (0.02,) * 48},
             {"gains": GAINED, "gain_half_widths": (1.1,) * 48},

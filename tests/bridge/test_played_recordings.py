@@ -5,24 +5,20 @@ import time
 from contextlib import nullcontext
 from pathlib import Path
 
-import can
 import numpy as np
 import pytest
 from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_npz, write_recording
-from can.interfaces.slcan import slcanBus
 from edge_samples import FakeModel, make_scan
 from mcap_samples import SURE
 
 from edge.api import Event, Stream, infer, open_recording, open_runtime
-from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.emulation.slcan_emulator import FRAME_S, Controller, Emulator, SlcanAdapter, bus_timeline
+from firmware_bridge.emulation.slcan_emulator import FRAME_S, Controller, Emulator, bus_timeline
 from firmware_bridge.errors import DeviceError, RecordingError, SourceError
 from firmware_bridge.links.demo import DemoLink
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Track
-from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.schedule import NS_PER_S, Ticker, sleep_until
 
@@ -97,7 +93,7 @@ def test_sources_without_a_name_are_called_by_their_place(tmp_path):
 def test_an_npz_at_its_recorded_times_or_at_another_rate(tmp_path):
     counts = make_counts(4)
     times_ns = [500, 500 + 3 * MS, 500 + 30 * MS, 500 + 33 * MS]
-    path = write_npz(tmp_path / "both.npz", counts, times_ns, ["4", "6", "4", "6"], rate_hz=1.0)
+    path = write_npz(tmp_path / "both.npz", counts, times_ns, ["4", "6", "4", "6"])
     for rate_hz, due_ms in ((None, [0, 3, 30, 33]), (10, [0, 0, 100, 100])):
         time, scans = FakeTime(), []
         with replay(time, path, rate_hz=rate_hz) as link:
@@ -244,28 +240,6 @@ def test_scans_lie_on_the_grid():
         assert np.diff(times_s[:16]) == pytest.approx([FRAME_S] * 15)
 
 
-# Answers of the adapter.
-
-FRAME = CanFrame(0x004, bytes.fromhex("937E317E1593120F"))
-
-
-@pytest.mark.parametrize(
-    ("talk", "hears"),
-    [  # it opens after bitrate and open alone, and what is open is not opened again
-        ([(b"O\rS8\r", b"\a\r"), (b"O\r", b"\r"), (b"O\rS8\rZ1\r", b"\a\a\a"), (b"C\rO\r", b"\r\r")], True),
-        ([(b"S6\rO\r", b"\r\r")], False),  # at another bitrate it hears nothing
-        ([(b"S8\rZ1", b"\r"), (b"\rO\r", b"\r\r"), (b"F\rF1\rt20120700\r", b"F00\r\az\r")], True),
-    ],
-)
-def test_an_adapter_obeys_and_refuses_as_a_strict_one(talk, hears):
-    adapter, stamped = SlcanAdapter(), b"Z1" in talk[0][0]
-    for commands, answers in talk:
-        assert adapter.feed(commands) == answers
-    assert adapter.hears_the_bus == hears
-    line = encode_frame(FRAME._replace(timestamp_ms=59_999 if stamped else None))
-    assert adapter.encode(FRAME, 59.9999) == line and adapter.encode(FRAME, 119.9999) == line
-
-
 def test_what_no_such_sensors_made_is_refused():
     other = make_recording(1)
     wide = Track("4", np.zeros((1, 3, 5, 6), dtype=np.int32), None)
@@ -288,30 +262,11 @@ def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
     assert (stacked(scans) == make_counts(200)).all()
 
 
-def test_python_can_reads_our_emulator():
-    recording, received = make_recording(20), list[can.Message]()
-    with (
-        Emulator([recording], loop=True) as emulator,
-        slcanBus(f"{emulator.port}@3000000", bitrate=1_000_000, rtscts=True, sleep_after_open=0) as bus,
-    ):
-        end_s = time.monotonic() + 60
-        while len(received) < 20 * 16 and time.monotonic() < end_s:
-            received += filter(None, [bus.recv(0.1)])
-    expected = [
-        (can_id, int(scan.reshape(3, 16)[2, taxel]))
-        for scan in recording.tracks[0].counts
-        for can_id, taxel in USPA44_MAP.wire_order("4")
-    ]
-    assert [(one.arbitration_id, int.from_bytes(one.data[5:7], "big")) for one in received] == expected
-
-
 @pytest.mark.parametrize(
     ("off_by_s", "ticks"),
     [  # each tick: the time worked before it, its number, and when it came, in [s]
         ((), [(0.0, 1, 0.01), (0.003, 2, 0.02), (0.0099, 3, 0.03)]),
-        ((), [(0.01, 1, 0.01)]),
         ((0.004,), [(0.0, 1, 0.014), (0.0, 2, 0.02)]),
-        ((), [(0.0199, 1, 0.0199), (0.0, 2, 0.02)]),
         ((), [(0.0201, 2, 0.0201), (0.0, 3, 0.03)]),
         ((), [(0.0349, 3, 0.0349), (0.0, 4, 0.04)]),
     ],
@@ -323,14 +278,6 @@ def test_ticks_lie_on_the_grid_however_long_the_work_takes(off_by_s, ticks):
     for work_s, tick, at_s in ticks:
         time.pass_s(work_s)
         assert (ticker.wait(), time.now_ns - start_ns) == (tick, round(at_s * NS_PER_S))
-
-
-def test_no_rate_drifts():
-    time = FakeTime()
-    ticker, start_ns = Ticker(59.7544117, time.clock, time.sleep), time.now_ns
-    for _ in range(10_000):
-        ticker.wait()
-    assert abs(time.now_ns - start_ns - 10_000 / 59.7544117 * NS_PER_S) < 2
 
 
 def test_sleeping_goes_on_until_the_deadline():

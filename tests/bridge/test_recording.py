@@ -180,7 +180,6 @@ def with_columns(names: str, cells: list[str]) -> str:
     [
         ("time", ["0.000", "0.010", "0.020", "0.031"], 100),
         ("timestamp", ["1700000000000000000", "1700000000010000000", "1700000000020000000"], 100),
-        ("Timestamp", ["1700000000.01", "1700000000.02", "1700000000.03"], 100),
         ("time [ms]", ["0", "1", "2"], 1000),
         ("t (\u00b5s)", ["0", "10000", "20000"], 100),
         ("time_ns", ["0", "10000000", "20000000"], 100),
@@ -202,8 +201,6 @@ def test_the_rate_of_a_csv_comes_from_its_times(tmp_path, name, times, rate_hz):
     ("name", "times", "why"),
     [
         ("time", [0, 0.01, 0.02, 0.01], "they go back at scan 4"),
-        ("time", [0.03, 0.02, 0.01], "they go back at scan 2"),
-        ("time", ["00:00.0", "00:00.1"], "that of scan 1 is neither a number nor a date and time"),
         ("time", [5], "there is one alone"),
         ("time", [0, "", 0.02], "that of scan 2 is neither a number nor a date and time"),
         ("time", [5, 5, 5], "they never change"),
@@ -252,8 +249,7 @@ def test_the_vendors_log(tmp_path):
 
 
 def test_npz(tmp_path):
-    recording = load_recording(write_two(tmp_path, pattern=np.zeros((4, 40, 40)), rate_hz=np.array(50.0)))
-    assert recording.rate_hz == 50.0
+    recording = load_recording(write_two(tmp_path, pattern=np.zeros((4, 40, 40))))
     assert [track.sensor for track in recording.tracks] == ["4", "6"]
     for track, rows in zip(recording.tracks, ([0, 2], [1, 3]), strict=True):
         assert track.counts.dtype == np.int32 and (track.counts == COUNTS[rows]).all()
@@ -267,31 +263,21 @@ OF_65 = {"sensor": np.arange(65).astype(str), "counts": np.zeros((65, 3, 4, 4), 
 @pytest.mark.parametrize(
     ("words", "changes"),
     [
-        ("array 'format': 'other', expected 'tactile-recording'", {"format": "other"}),
-        ("array 'format'", {"format": ["tactile-recording"]}),
+        ("array 'format': 'tactile-results', .* play the .mcap", {"format": "tactile-results"}),
         ("array 'version': 2, expected 1", {"version": 2}),
-        ("array 'version'", {"version": 1.0}),
         ("array 'counts': missing", {"counts": None}),
-        ("array 'counts': float64", {"counts": np.zeros((4, 3, 4, 4))}),
         *(
             (r"\(scans, 3, rows, cols\), 64 taxels at most, at least one scan", {"counts": np.zeros(shape, np.int32)})
-            for shape in ((4, 4, 4, 3), (0, 3, 4, 4), (4, 3, 16), (4, 3, 0, 4), (4, 3, 5, 13))
+            for shape in ((4, 4, 4, 3), (0, 3, 4, 4), (4, 3, 5, 13))
         ),
         (r"array 'counts': counts 65536\.\.65536", {"counts": np.full((4, 3, 4, 4), 65536)}),
-        (r"array 'counts': counts -2\.\.", {"counts": np.full((4, 3, 4, 4), -2)}),
         ("absent on some axes", {"counts": np.full((4, 3, 4, 4), [[[-1]], [[0]], [[0]]])}),
-        ("a baseline that were cut off at 0", {"counts": np.full((4, 3, 4, 4), [[[0]], [[9]], [[9]]])}),
-        ("array 'sensor': int64", {"sensor": [4, 6, 4, 6]}),
         ("array 'sensor'", {"sensor": ["4"]}),
         ("printable", {"sensor": ["4", "6", "6", "4\n5"]}),
         ("65 sensors, expected at most 64", OF_65 | dict.fromkeys(("scan", "time_ns"), np.arange(65))),
-        ("plain arrays", {"sensor": np.array(["4", 6, None, {}], dtype=object)}),
         ("array 'time_ns'", {"time_ns": np.zeros(4)}),
         ("array 'time_ns': times of sensor '4' that go back", {"time_ns": [5, 0, 4, 0]}),
-        (r"times 5\.\.2305843009213693952, expected 0", {"time_ns": [5, 0, 1 << 61, 0]}),
         ("expected 0", {"time_ns": np.array([5, 0, 1 << 63, 0], np.uint64)}),
-        *(("a positive number", {"rate_hz": rate_hz}) for rate_hz in (0.0, float("nan"), 1e-300)),
-        ("array 'rate_hz'", {"rate_hz": [50.0]}),
     ],
 )
 def test_npz_that_is_none(tmp_path, words, changes):
@@ -305,12 +291,9 @@ def test_files_that_cannot_be_read(tmp_path):
     (tmp_path / "folder.csv").mkdir()
     for name, content, words in (
         ("gone.csv", None, r"gone\.csv: cannot be read: No such file"),
-        ("gone.npz", None, r"gone\.npz: cannot be read: No such file"),
         ("folder.csv", None, r"folder\.csv is a folder, expected a recording: it holds no \.mcap"),
         ("finger.txt", b"", r"ends in \.csv, \.npz or \.mcap"),
         ("finger.csv", HEADER.encode(), r"finger\.csv, .*expected a row of counts"),
-        ("finger.npz", b"", "finger"),
-        ("finger.npz", whole[: len(whole) // 4], "finger"),
         ("finger.npz", whole[:-1], "not a whole .npz archive"),
         ("finger.npz", whole[:600] + bytes([whole[600] ^ 0xFF]) + whole[601:], "finger"),
     ):

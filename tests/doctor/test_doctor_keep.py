@@ -22,7 +22,7 @@ from firmware_bridge.sensor_file.model import PadFrame, SensorEntry, SensorFile,
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 GAINS = tuple(np.linspace(0.9, 1.1, 48).tolist())
-WHOLE = SensorEntry(Mounting(swap_xy=True, gains=GAINS), 1180.0, BASELINE)
+WHOLE = SensorEntry(Mounting(swap_xy=True), 1180.0, BASELINE)
 NONE: dict = {}
 ASSUMED: dict = {"assumed": frozenset({"mounting"})}
 
@@ -45,7 +45,7 @@ class TestLoss:
             SensorEntry(
                 baseline=BASELINE, counts_per_newton=1180.0, counts_per_newton_interval=(1100.0, 1260.0), **ASSUMED
             ),
-            SensorEntry(Mounting(swap_xy=True, gains=GAINS), pad=Pad(thickness_mm=4.2), frame=PadFrame("tool0")),
+            SensorEntry(Mounting(swap_xy=True), pad=Pad(thickness_mm=4.2), frame=PadFrame("tool0")),
         ],
     )
     def test_what_is_not_measured_again_is_kept(self, tmp_path, held):

@@ -9,7 +9,7 @@ import pytest
 import zstandard
 from edge_samples import FakeModel, make_contract
 from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Schema
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from mcap_samples import OFFSET_NS
 
@@ -19,7 +19,7 @@ from edge.pipeline.result_stream import Stream
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.recording import mcap_reader as mcap_recording
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.mcap_records import MOST_RECORD_BYTES
+from firmware_bridge.recording.mcap_records import MOST_CHUNK_BYTES
 from firmware_bridge.recording.scan_messages import SENSOR, baseline_type, encode_baseline, encode_scan, scan_type
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
@@ -62,12 +62,12 @@ def refused(path, words):
 
 def test_files_that_are_something_else(tmp_path):
     refused(written(tmp_path, magic=b"PK\3\4 not an mcap"), r"made\.mcap: not an MCAP file")
-    refused(written(tmp_path), r"no scans that edge-sr recorded; .* breaks off \(without an end, at byte 8\)")
+    refused(written(tmp_path), r"no scans that edge-sr recorded; .* breaks off \(after byte 0\)")
     refused(tmp_path / "gone.mcap", r"gone\.mcap: cannot be read: No such file")
 
 
-@pytest.mark.parametrize("compression", CompressionType)
-def test_in_a_file_of_others_scans_are_found_or_its_topics_named(tmp_path, compression):
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD])
+def test_in_a_file_of_others_scans_are_found(tmp_path, compression):
     path = tmp_path / "other.mcap"
     for scans in (0, 3):
         with path.open("wb") as file:
@@ -82,7 +82,7 @@ def test_in_a_file_of_others_scans_are_found_or_its_topics_named(tmp_path, compr
                 writer.add_message(writer.register_channel("/t", "cdr", kind), OFFSET_NS, scan, OFFSET_NS)
             writer.finish()
         if not scans:
-            refused(path, r"no scans that edge-sr recorded; its topics are '/camera\\n0', .*, and 2 more")
+            refused(path, "no scans that edge-sr recorded$")
     recording = load_recording(path)
     assert recording.tracks[0].numbers.tolist() == [0, 1, 2]
     assert "the mounting of sensor 4 is not in the file" in recording.notes[0]
@@ -90,7 +90,7 @@ def test_in_a_file_of_others_scans_are_found_or_its_topics_named(tmp_path, compr
 
 OF_A_SCAN, OF_A_BASELINE, OF_A_SENSOR = channel_of(SCAN), channel_of(BASELINE, 2), channel_of(SENSOR, 2)
 UNKNOWN_DATE = {"created_unix_s": float("nan")}
-SEATED = {"order": list(range(16)), "swap_xy": False, "signs": [1, 1, 1], "gains": [1.0] * 48}
+SEATED = {"order": list(range(16)), "swap_xy": False, "signs": [1, 1, 1]}
 
 
 def of_scans(*changes, **settings):
@@ -105,16 +105,21 @@ def of_scans(*changes, **settings):
             (rf"topic '/t1': .*{name}", of_scans(changes))
             for name, changes in (
                 ("sensor", {"sensor": ""}),
+                ("sensor", {"sensor": "a\nb"}),
                 ("number", {"number": -1}),
                 ("time_ns", {"time_ns": -1}),
                 ("time_ns", {"time_ns": 1 << 61}),
                 ("device_time_ns", {"device_time_ns": -2}),
                 ("fresh", {"fresh": 0x1FFFF}),
+                ("fresh", {"renewed": 0x10000}),
                 ("fresh", {"fresh": 0xFFFE, "renewed": 1}),
                 ("one on each axis", {"fresh": 0xFFFE, "renewed": 0}),
+                ("one on each axis", {"counts": np.full(48, -1)}),
+                ("counts", {"counts": np.full(48, -2)}),
                 ("counts", {"counts": np.full(48, 0x10000)}),
                 ("vendor_newtons", {"vendor_newtons": np.zeros(47)}),
                 ("vendor_newtons", {"vendor_newtons": np.full(48, np.nan)}),
+                ("vendor_newtons", {"vendor_newtons": np.full(48, -1001.0)}),
                 ("vendor_temperature_k", {"vendor_temperature_k": np.full(16, 199.0)}),
                 ("vendor_ups_hz", {"vendor_ups_hz": np.full(16, -1.0)}),
             )
@@ -124,6 +129,8 @@ def of_scans(*changes, **settings):
             for name, changes in (
                 ("sensor", {"sensor": ""}),
                 ("id", {"id": ""}),
+                ("created_unix_s", {"created_unix_s": -1.0}),
+                ("age_s", UNKNOWN_DATE | {"age_s": -1.0}),
                 ("age_s", UNKNOWN_DATE | {"age_s": 1e300}),
                 ("created_unix_s", {"created_unix_s": 1e300}),
                 ("scans", {"scans": 0}),
@@ -135,15 +142,18 @@ def of_scans(*changes, **settings):
                 "made.mcap",
                 (*OF_A_SENSOR, message(SENSOR, GOOD | {"facts": said}, 2), *of_scans({})),
             )
-            for said in ("", "[" * 5000, '{"mounting": {}}', '{"geometry": {"rows": "9"}}')
+            for said in ("", "[]", "[" * 5000, '{"mounting": 1}', '{"mounting": {}}', '{"geometry": {"rows": "9"}}')
         ),
         *(
-            ("no mounting of sensor '4'", (Metadata("mounting", {"sensor": "4", "mounting": said}),))
+            (
+                "no mounting of sensor '4'",
+                (*OF_A_SENSOR, message(SENSOR, GOOD | {"facts": json.dumps({"mounting": {"mounting": said}})}, 2)),
+            )
             for said in (
-                *("", "{}", "[" * 5000),
+                *("", "[]", "{}", "[" * 5000),
                 json.dumps(SEATED | {"order": [0] * 16}),
-                json.dumps(SEATED | {"gains": [1e999] * 48}),
                 json.dumps(SEATED | {"swap_xy": 2}),
+                json.dumps(SEATED | {"order": [0.0, *range(1, 16)]}),
             )
         ),
         ("times of sensor '4' that go back", of_scans({"time_ns": 10}, {"time_ns": 9})),
@@ -180,27 +190,30 @@ def test_what_is_read_can_be_recorded_again(tmp_path, log_ns, second_ns):
 
 
 def chunk(data, compression="zstd", size=None, crc=0, packed=None):
-    packed = zstandard.compress(data) if packed is None else packed
+    packed = (zstandard.compress(data) if compression else data) if packed is None else packed
     return Chunk(compression, packed, 0, 0, crc, len(data) if size is None else size)
 
 
 BOMB = zstandard.compress(bytes(1 << 28))
+UNSIZED_BOMB = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1 << 28))
 
 
 @pytest.mark.parametrize(
     ("broken", "words"),
     [
         (chunk(b"", size=1 << 40), "expected at most"),
+        (chunk(b"", packed=BOMB, size=1 << 28), "expected at most"),
         (chunk(b"", packed=BOMB, size=1 << 20), r"does not hold the 1,048,576 bytes"),
-        (chunk(b"abc", packed=b"nothing"), "cannot be unpacked"),
-        (chunk(b"abc", crc=1), "check sum"),
-        (chunk(b"abc", "rot13"), "compressed by 'rot13'"),
-        (chunk(b"abc"), "a chunk that is cut off"),
+        (chunk(b"", packed=UNSIZED_BOMB, size=1 << 20), "cannot be read"),
+        (chunk(b"abc", packed=b"nothing"), "cannot be read"),
+        (chunk(b"abc", crc=1), "crc validation failed"),
+        (chunk(b"abc", "lz4"), "compressed by 'lz4', expected zstd or nothing"),
+        (chunk(b"abc"), "cannot be read"),
         (chunk(struct.pack("<BQ", 5, 1 << 60)), "a chunk that is cut off"),
-        (chunk(struct.pack("<BQ", 5, 3) + b"abc"), "a message that is cut off"),
-        (struct.pack("<BQ", 6, 1 << 62), "within a record"),
-        (struct.pack("<BQ", 6, 40) + bytes(28) + struct.pack("<IQ", 0, 1 << 62), "cannot be unpacked"),
-        (struct.pack("<BQ", 6, MOST_RECORD_BYTES + 1) + bytes(MOST_RECORD_BYTES + 1), "expected at most"),
+        (struct.pack("<BQ", 6, 1 << 62), "exceeds limit"),
+        (struct.pack("<BQ", 4, 8) + b"\xff" * 8, "breaks off"),
+        (struct.pack("<BQ", 6, 40) + bytes(28) + struct.pack("<IQ", 0, 1 << 62), "breaks off"),
+        (chunk(bytes(MOST_CHUNK_BYTES + 1), ""), "expected at most"),
     ],
 )
 def test_chunks_made_to_harm_end_it_and_keep_what_was_before(tmp_path, broken, words):
@@ -209,12 +222,9 @@ def test_chunks_made_to_harm_end_it_and_keep_what_was_before(tmp_path, broken, w
     assert len(recording.tracks[0].counts) == 1
     note, _ = recording.notes
     assert len(note) < 1000 and "\n" not in note
-    if words == "within a record":
-        assert "breaks off (within a record, at byte" in note
-    else:
-        behind = (tmp_path / "made.mcap").stat().st_size
-        left = int(re.search(r"is damaged \(.*\): ([0-9,]+) bytes after that are not read", note)[1].replace(",", ""))
-        assert 0 < left < behind
+    if words != "breaks off":
+        left = re.search(r"is damaged \(.*\): ([0-9,]+) bytes after that are not read", note)[1]
+        assert 0 < int(left.replace(",", "")) < (tmp_path / "made.mcap").stat().st_size
     with pytest.raises(RecordingError, match=words):
         load_recording(written(tmp_path, broken))
 

@@ -16,7 +16,7 @@ from edge.inference.trust_model import features
 from edge.perception.pattern_description import LEAST_FORCE_N, Balance, wrench_of
 from edge.sinks.mcap import McapSink
 from edge.sinks.ros2.map_messages import recorded_map
-from edge.sinks.ros2.messages import GRID, WRENCH_STAMPED, force_and_torque
+from edge.sinks.ros2.messages import WRENCH_STAMPED, force_and_torque
 
 PITCH_MM, PIXELS = 4.7, 8
 NEAR = {"counts_per_newton": (1300.0, 1500.0)}
@@ -117,7 +117,7 @@ def test_a_recording_holds_it_as_messages_and_as_arrays(tmp_path):
     told, wrench = messages_of(tmp_path / "out.mcap"), results[1].wrench
     assert results[1].traction is not None and wrench is not None
     [(_, traction)], [(_, data)] = told["/s4/traction"], told["/s4/wrench"]
-    np.testing.assert_allclose(recorded_map(GRID.name, traction), results[1].traction * 1e3, rtol=1e-6)  # in [Pa]
+    np.testing.assert_allclose(recorded_map(traction), results[1].traction * 1e3, rtol=1e-6)  # in [Pa]
     stamped = WRENCH_STAMPED.decode(data)["wrench"]
     assert list(stamped["force"].values()) == pytest.approx([0, 0, FORCE_N])
     assert list(stamped["torque"].values()) == pytest.approx([one / 1000 for one in wrench.torque_n_mm])

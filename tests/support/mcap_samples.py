@@ -17,7 +17,7 @@ from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading
 
 OFFSET_NS = 1_700_000_000_000_000_000
 SURE = make_contract(interval_factor=1.6)
-TURNED = Mounting(order=tuple(reversed(range(16))), swap_xy=True, signs=(1, -1, 1))
+TURNED = Mounting(tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()), True, (1, -1, 1))
 
 
 def odd_scans(count: int = 12) -> list[Scan]:

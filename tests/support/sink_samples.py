@@ -19,7 +19,7 @@ from edge.perception.runtime import Runtime
 from edge.pipeline.sink import Sink
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2.map_messages import recorded_map
-from edge.sinks.ros2.messages import GRID, LOG, RESULT
+from edge.sinks.ros2.messages import LOG, RESULT
 
 RUN = {"dropped": 2, "overruns": 1, "torn_wire": 3, "torn_source": 4}
 CONTRACT = make_contract(interval_factor=1.6)
@@ -148,7 +148,7 @@ class Mcap(Opened):
         by_topic = messages_of(self.path)
         found = []
         for sensor in SENSORS:
-            patterns = {at: recorded_map(GRID.name, data) * 1e3 for at, data in by_topic[f"/s{sensor}/pattern"]}
+            patterns = {at: recorded_map(data) * 1e3 for at, data in by_topic[f"/s{sensor}/pattern"]}
             for at, data in by_topic[f"/s{sensor}/result"]:
                 found.append(of_record(json.loads(RESULT.decode(data)["record"]), patterns.get(at)))
         return sorted(found, key=lambda one: one.scan or 0)

@@ -84,30 +84,22 @@ def grid(name: str, values: NDArray[np.float32], frame: str, unix_ns: int, geome
     )
 
 
-def recorded_map(schema: str, data: bytes | memoryview) -> NDArray[np.float32]:
-    """Return the map (H, W), or (3, H, W) of vectors, in a Grid, or in an Image as earlier releases recorded them.
+def recorded_map(data: bytes) -> NDArray[np.float32]:
+    """Return the map (H, W), or (3, H, W) of vectors, in a Grid.
 
-    Raises a CdrError where it is none of these, a ValueError where it is of other numbers.
+    Raises a CdrError where it is none, a ValueError where it is of other numbers.
     """
-    if schema == GRID.name:
-        message = GRID.decode(data)
-        count, kinds = len(message["fields"]), {field["type"] for field in message["fields"]}
-        if kinds != {_FLOAT32}:
-            raise ValueError(f"a grid of numbers of type {sorted(kinds)}, expected {_FLOAT32}, float32")
-        columns, strides = message["column_count"], (message["row_stride"], message["cell_stride"])
-        offsets = [field["offset"] for field in message["fields"]]
-        wanted = (4 * count * columns, 4 * count)
-        if not columns or strides != wanted or offsets != [*range(0, 4 * count, 4)] or len(message["data"]) % wanted[0]:
-            raise ValueError(
-                f"a grid of {columns} columns, strides {strides}, fields at {offsets}: expected whole rows"
-            )
-        layers = message["data"].view("<f4").reshape(-1, columns, count).transpose(2, 0, 1)
-        return layers[0] if count == 1 else layers
-    message = IMAGE.decode(data)
-    if message["encoding"] not in ("32FC1", "32FC3") or message["is_bigendian"]:
-        raise ValueError(f"an image of encoding {message['encoding'][:20]!r}, expected 32FC1, little-endian")
-    values = message["data"].view("<f4").reshape(message["height"], message["width"], -1)
-    return values[..., 0] if message["encoding"] == "32FC1" else values.transpose(2, 0, 1)
+    message = GRID.decode(data)
+    count, kinds = len(message["fields"]), {field["type"] for field in message["fields"]}
+    if kinds != {_FLOAT32}:
+        raise ValueError(f"a grid of numbers of type {sorted(kinds)}, expected {_FLOAT32}, float32")
+    columns, strides = message["column_count"], (message["row_stride"], message["cell_stride"])
+    offsets = [field["offset"] for field in message["fields"]]
+    wanted = (4 * count * columns, 4 * count)
+    if not columns or strides != wanted or offsets != [*range(0, 4 * count, 4)] or len(message["data"]) % wanted[0]:
+        raise ValueError(f"a grid of {columns} columns, strides {strides}, fields at {offsets}: expected whole rows")
+    layers = message["data"].view("<f4").reshape(-1, columns, count).transpose(2, 0, 1)
+    return layers[0] if count == 1 else layers
 
 
 def taxels(scan: Scan) -> NDArray[np.float32]:
