@@ -52,7 +52,7 @@ _SENSOR_TEXT: Final = """\
 # What the scans of a sensor mean, repeated, since tools copy messages alone, or those from some time on.
 std_msgs/Header header
 string sensor
-string facts                    # JSON: geometry of the pad, kind of source, mounting, and units of the maps
+string facts                    # JSON: by name, what the file's metadata records hold as well, and units
 """
 _POSE_TEXT: Final = """\
 # Pose of a pad in the plane of the object that it touches: x to the right, y down, a turn from x to y.
