@@ -1,4 +1,4 @@
-"""The demo around one run: its robot, its scenes, its score against the truth, and its map."""
+"""The demo around one run: its scenes, its score against the truth, and its map."""
 
 import os
 import sys
@@ -19,12 +19,10 @@ from edge.mapping.sink import MapSink, MapState
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.commands import RESET, Commands
-from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.terminal.argument_types import columns
 from edge.terminal.heatmap import Panel, draw, shows_colours
 from edge.terminal.progress_bar import drawn
-from firmware_bridge.poses import PadPose
 from firmware_bridge.zeroing.baseline import deformation
 
 if TYPE_CHECKING:
@@ -47,16 +45,9 @@ class DemoRecording:
         counts = self.arrays["counts"]
         self.figure_taps = len(self.arrays["tap_pose"])
         self.scenes = dict(zip(map(_key, counts), self.arrays["scene"].tolist(), strict=True))
-        # Tap and indentation in [mm] of each scan of one; after those of the figure come those played in their place.
         played = zip(counts, self.arrays["tap"].tolist(), self.arrays["indentation_mm"].tolist(), strict=True)
+        # Tap and indentation in [mm] of each scan of one.
         self.taps = {_key(scan): (tap, depth_mm) for scan, tap, depth_mm in played if tap >= 0}
-        options = zip(self.arrays["option_counts"], self.arrays["option_indentation_mm"].tolist(), strict=True)
-        for tap, (scans, depths_mm) in enumerate(options, self.figure_taps):
-            self.taps |= {_key(scan): (tap, depth_mm) for scan, depth_mm in zip(scans, depths_mm, strict=True)}
-
-    def place_of(self, tap: int) -> tuple[str, int]:
-        """Return how the names of a tap's arrays begin, and its row in them."""
-        return ("", tap) if tap < self.figure_taps else ("option_", tap - self.figure_taps)
 
 
 def _key(counts: NDArray[np.integer]) -> bytes:
@@ -159,15 +150,13 @@ class DemoScore:
         return None if press is None else self._true_pattern(*press)
 
     def _true_pattern(self, tap: int, indentation_mm: float) -> NDArray[np.float32]:
-        whose, row = self._recording.place_of(tap)
-        return self._recording.arrays[f"{whose}unit_patterns"][row].astype(np.float32) * np.float32(indentation_mm)
+        return self._recording.arrays["unit_patterns"][tap].astype(np.float32) * np.float32(indentation_mm)
 
     def _score(self, number: int, result: Result, tap: int, indentation_mm: float) -> TapScore:
         if result.pattern is None:
             raise ValueError("peak has no pattern, expected one kept by add")
         full_scale, truth = self._model.contract.output_full_scale, self._true_pattern(tap, indentation_mm)
-        whose, row = self._recording.place_of(tap)
-        x_mm, y_mm, turn_deg = self._recording.arrays[f"{whose or 'tap_'}pose"][row, :3].tolist()
+        x_mm, y_mm, turn_deg = self._recording.arrays["tap_pose"][tap, :3].tolist()
         alone = result.pattern if result.taps_used < 2 else self._alone(result)
         error_db = float(psnr_db(result.pattern, truth, full_scale))
         errors = (float(rmse_percent(pattern, truth, full_scale)) for pattern in (result.pattern, alone))
@@ -288,7 +277,6 @@ class Demo(Sink):
     def __init__(
         self,
         model: Model,
-        source: Source,
         stream: TextIO,
         view: "LiveView | None",
         watching: Sequence[Sink],
@@ -305,24 +293,18 @@ class Demo(Sink):
             view.show_truth(self._score.truth)
         self.map = DemoMap(recording, None if view is None else view.show_map) if maps else None
         self._unprinted = [self._score, *([] if self.map is None else [self.map])]
-        # Without poses a model's taps must follow the paper's schedule, as the recording does.
-        self._touch = source.steer() if model.contract.takes_poses else None
-        self._tapping = False
 
         def tell(event: Event) -> None:
             for sink in watching:
                 sink.tell(event, {})
 
         self._scenes = DemoScenes(recording, tell, lambda: commands.put(RESET))
-        how = "where it is proposed" if self._touch else "by a fixed schedule"
         taps = f"{str(recording.arrays['surface'])!r} {recording.figure_taps} times"
-        sys.stderr.write(f"demo: an emulated sensor taps {taps}, {how}, zeroed first\n")
+        sys.stderr.write(f"demo: an emulated sensor taps {taps}, turned by 5 degrees each time, zeroed first\n")
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Follow the demo."""
         self._score.add(result)
-        if self._touch is not None:
-            self._steer(result, self._touch)
         self._scenes.add(result)
         complete = [part for part in self._unprinted if part.complete] if self._loops else []
         for part in complete:
@@ -330,14 +312,6 @@ class Demo(Sink):
         if complete and not self._unprinted:
             page = "" if self._view is None else f"live page: {self._view.url}; "
             sys.stderr.write(f"\n{page}the demo continues until Ctrl-C\n")
-
-    def _steer(self, result: Result, touch: Callable[[PadPose | None], object]) -> None:
-        """Send the robot, after each tap of the figure, where the next one is proposed."""
-        if result.contact:
-            self._tapping |= _key(result.scan.counts) in self._recording.taps
-        elif self._tapping and result.contact is False:
-            self._tapping = False
-            touch(None if result.next_tap is None else result.next_tap.target)
 
     def finish(self) -> None:
         """Print what was not printed while the demo went on."""

@@ -228,7 +228,7 @@ def run(
 
                 scores = sys.stderr if "jsonl:-" in options.sink else sys.stdout
                 watching = [messages, *(() if view is None else view.sinks)]
-                played = demo.Demo(model, source, scores, view, watching, commands, loops=loops, maps=mapping is None)
+                played = demo.Demo(model, scores, view, watching, commands, loops=loops, maps=mapping is None)
                 asked = replace(asked, every_scan=True)  # it shows the run time of every scan
             if loops:
                 # After 100 scans without contact it is at its first tap: 180 lie before it, 34 between taps.

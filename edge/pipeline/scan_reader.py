@@ -14,7 +14,7 @@ from edge.pipeline.cadence import ReadingPace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, LinkReader, Notice, SourceKind
-from firmware_bridge.poses import PadPose, TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.tracks import origin_of
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import POLL_S
@@ -156,10 +156,6 @@ class Source:
         if not self._opened:
             raise self._not_open()
         return self._readers[0].link.kind
-
-    def steer(self) -> Callable[[PadPose | None], None] | None:
-        """Return the function by which the emulated robot of the demo is asked where to tap next; None without."""
-        return next((asked for one in self._readers if (asked := one.link.steer()) is not None), None)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of received, skipped and missed items so far, by name; sums over all links."""
