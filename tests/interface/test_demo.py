@@ -1,4 +1,3 @@
-import dataclasses
 import json
 from itertools import pairwise
 
@@ -9,7 +8,7 @@ from edge_samples import BASELINE, FakeLink, FakeModel, make_scan
 from pose_samples import make_posed_contract, write_posed_model
 from trust_samples import make_posed_trust
 
-from edge.api import POSED_MODEL, USPA44, Event, Runtime, Source, demo_recording, load_model
+from edge.api import POSED_MODEL, USPA44, Runtime, Source, demo_recording, load_model
 from edge.cli import run_command
 from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore
 from edge.cli.main import parsed_options
@@ -77,33 +76,20 @@ def test_a_lost_scan_shifts_nothing(recording):
     assert gappy[0].result.scan.number != whole[0].result.scan.number
 
 
-def told_of_scenes(results, path):
-    events = []
-    scenes = DemoScenes(DemoRecording(path), events.append, lambda: pytest.fail("it goes on to no other object"))
-    for result in results:
-        scenes.add(result)
-    assert {event.kind for event in events} <= {"note"}
-    return [event.text.removeprefix("demo: ") for event in events]
-
-
-def test_each_scene_is_announced_and_then_told_how_it_went(recording, tmp_path):
-    """Two passes; the scans of the second are doubted where the first are believed."""
+def test_each_scene_is_announced(recording, tmp_path):
     with np.load(recording) as data:
         arrays = dict(data)
     np.savez(tmp_path / "scenes.npz", **arrays | {"scene": np.array([-1, -1, 0, 0, 0, -1, 1, 1, -1])})
     runtime, series = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE}), ScanSeries("4", USPA44)
-    scans = [series.close(counts.copy(), n * 10_000_000) for n, counts in enumerate([*arrays["counts"]] * 2)]
-    results = [runtime.push(scan) for scan in scans]
-    results[9 + 3] = dataclasses.replace(results[9 + 3], events=(Event(0, "tap_dropped", "4"),))
-    results[9 + 7] = dataclasses.replace(results[9 + 7], trusted=False, untrusted_reason="unfamiliar")
-    first, second = (told_of_scenes(part, tmp_path / "scenes.npz") for part in (results[:9], results[9:]))
-    assert first[0].startswith("now another surface is ") and first[2].startswith("now a magnet comes ")
-    assert second[::2] == first[::2]
-    assert first[1].startswith("no tap was dropped") and first[3] == "none of 2 patterns with the magnet was checked"
-    assert second[1] == "times that earlier taps were dropped: 1" and second[3].startswith(
-        "1 of 2 patterns with the magnet"
-    )
-    assert len(told_of_scenes(results[:7], tmp_path / "scenes.npz")) == 3, "a scene that is cut off has no outcome"
+    results = [runtime.push(series.close(counts.copy(), n * 10_000_000)) for n, counts in enumerate(arrays["counts"])]
+    events = []
+    scenes = DemoScenes(DemoRecording(tmp_path / "scenes.npz"), events.append, lambda: pytest.fail("no other object"))
+    for result in results:
+        scenes.add(result)
+    assert [(event.kind, event.text[:24]) for event in events] == [
+        ("note", "demo: now another surfac"),
+        ("note", "demo: now a magnet comes"),
+    ]
 
 
 def test_the_bundled_model_drops_foreign_taps_and_flags_a_magnet():
