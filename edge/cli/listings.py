@@ -1,7 +1,6 @@
 """`edge-sr models` and `edge-sr devices`: what is bundled, and what is plugged in."""
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from typing import Final, TextIO
@@ -50,14 +49,8 @@ def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         default = {DEFAULT_MODEL: " default", POSED_MODEL: " with poses"}.get(path.stem, "")
         out.write(f"{cells}{figures}{times}{default}\n")
     out.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
-    if not took_us:
-        return
-    out.write(f"run times of {ROUNDS * TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
-    # The ratio is 1.2 to 1.4 on a quiet machine.
-    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > 3 * p50]
-    if uneven:
-        named = ", ".join(uneven)
-        out.write(f"those of {named} are uneven, as on a busy machine: measure again when it is quiet\n")
+    if took_us:
+        out.write(f"run times of {ROUNDS * TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
 
 
 def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
@@ -81,15 +74,12 @@ def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
 
 
 def show_devices(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
-    """Print the devices, opening none, what to type to read each, and what prevents its use; with --json for programs.
+    """Print the devices, opening none, what to type to read each, and what prevents its use.
 
     Raises DeviceError if no adapter is among them.
     """
     listed, notes = devices()
-    if options.json:
-        out.write(json.dumps({"devices": [device._asdict() for device in listed], "notes": notes}, indent=1) + "\n")
-    else:
-        out.write("".join(f"{line}\n" for line in page(listed, notes, columns())))
+    out.write("".join(f"{line}\n" for line in page(listed, notes, columns())))
     if not any(device.adapter for device in listed):
         raise DeviceError(NOTHING)
 

@@ -13,7 +13,6 @@ from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.links.registry import FORMS as SOURCES
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.pad_constants import PAD_RANGES
-from firmware_bridge.zeroing.baseline import FEWEST_RECORDED, FEWEST_SCANS
 
 _SETTINGS: Final[dict[Any, Any]] = {bool: {"action": "store_true"}, list: {"action": "append", "default": []}}
 """Settings of argparse for an option without a value, and for one that may be repeated."""
@@ -52,7 +51,6 @@ SENSOR: Final = (
     Option("--id-map MAP", str, "kind of pad: which CAN message is which taxel: %(choices)s; A and B are boards before "
            f"2021 (default {USPA44_MAP.name})", choices=ID_MAPS),
     Option("--rate-hz R", positive, "scans a second at which a recording is played; for a device, its expected rate"),
-    Option("--force", bool, "use a sensor file of an emulated sensor on a real one all the same"),
 )
 RESULTS: Final = (
     Group("model",
@@ -298,12 +296,6 @@ All other options are those of edge-sr: its --help lists sources, outputs and ke
             Group(
                 "baseline",
                 Option("--out FILE", Path, "file for the baseline", required=True),
-                Option(
-                    "--scans N",
-                    whole(FEWEST_RECORDED),
-                    f"scans to average (default and minimum {FEWEST_SCANS}; of a recording at least {FEWEST_RECORDED})",
-                ),
-                Option("--skip N", whole(0), "scans to leave out at the start (default 0)"),
             ),
         ),
         """\
@@ -313,17 +305,14 @@ examples:
   edge-sr baseline --out zero.json
   edge-sr --baseline zero.json
 
-Of a recording it takes the scans during which the pad is still and pressed least, or those that you name:
-  edge-sr baseline --out zero.json \\
-          --source replay:f.csv \\
-          --skip 190 --scans 60
+Of a recording it takes the scans during which the pad is still and pressed least.
 """,
     ),
     "devices": Subcommand(
         "edge.cli.listings:show_devices",
         "Lists serial ports, CAN adapters and CAN interfaces, what to type after --source for each, and what prevents "
         "its use.",
-        (Group(None, Option("--json", bool, "write JSON, for programs")),),
+        (),
         "Exit code: 3 if there is no adapter.",
     ),
     "doctor": Subcommand(

@@ -109,18 +109,17 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         with options.out.open("rb") as file:
             if FILE_FORMAT.encode() not in file.read(1 << 16):
                 raise UsageError(f"{options.out} holds something else: give another name, or delete it first")
-    if len(options.source) == 1 and options.source[0].startswith("replay:") and options.skip is options.scans is None:
+    if len(options.source) == 1 and options.source[0].startswith("replay:"):
         from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
 
         kind, sensor_file = "replay", sensor_settings(options.sensor, options.id_map)
         played = options.source[0].removeprefix("replay:")
-        baselines, notes = recorded_baselines(played, sensor_file, options.rate_hz, force=options.force)
+        baselines, notes = recorded_baselines(played, sensor_file, options.rate_hz)
         print("\n".join(notes), file=err)
     else:
         with stop_on_signals() as stop, _source(options, give_up_s=0) as source:
             kind, sensor_file = source.kind, source.sensor_file
-            asked = {name: value for name in ("scans", "skip") if (value := getattr(options, name)) is not None}
-            baselines = take_baselines(source, **asked, stop=stop)
+            baselines = take_baselines(source, stop=stop)
     save_baselines(options.out, baselines.values(), sensor_file.orders)
     for name, stored in sorted(baselines.items()):
         emulated = "" if kind == "device" else f" ({kind.upper()})"
@@ -130,7 +129,7 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 
 
 def _source(options: argparse.Namespace, give_up_s: float) -> Source:
-    names = ("sensor", "id_map", "rate_hz", "force")
+    names = ("sensor", "id_map", "rate_hz")
     return open_source(*options.source, give_up_s=give_up_s, **{name: getattr(options, name) for name in names})
 
 

@@ -240,7 +240,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         failed: BridgeError | None = None
         whole = False
         with reader:
-            refuse_emulated(sensor_file, link.kind, link.origin, options.force)
+            refuse_emulated(sensor_file, link.kind, link.origin)
             try:
                 visit.watch(watched)
                 whole = not stop.is_set()

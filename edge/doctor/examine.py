@@ -215,6 +215,6 @@ def examine(
     sensor_file = sensor_settings(sensor, id_map)
     reader, sensor_file, watched = prepare(texts, sensor_file, stored_baselines(baselines, sensor_file), rate_hz)
     with reader:
-        refuse_emulated(sensor_file, reader.link.kind, reader.link.origin, force=False)
+        refuse_emulated(sensor_file, reader.link.kind, reader.link.origin)
         watch(reader, watched, duration_s, threading.Event() if stop is None else stop)
     return judge(watched, time.time()).findings

@@ -8,49 +8,43 @@ from collections.abc import Callable
 from edge.pipeline.run_statistics import silence_hint
 from edge.pipeline.scan_reader import Source
 from edge.terminal.progress_bar import progress
-from edge.validation import check_whole
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import GIVEN_UP_S, POLL_S
-from firmware_bridge.zeroing.baseline import FEWEST_RECORDED, FEWEST_SCANS, Baseline, BaselineEstimator
+from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 
 
 def take_baselines(
     source: Source,
     *,
-    scans: int = FEWEST_SCANS,
-    skip: int = 0,
     stop: threading.Event | None = None,
     clock_s: Callable[[], float] = time.monotonic,
 ) -> dict[str, Baseline]:
     """Take the baselines of all sensors of a source, by name, from free, still pads; give up at the first refusal.
 
-    The scans of the source go nowhere else meanwhile. The median is of so many complete `scans` of each sensor, 100 or
-    more, of a recording 30 or more, after those to `skip`; `stop` ends it early.
+    The scans of the source go nowhere else meanwhile. `stop` ends it early.
 
     Raises:
         BaselineRefusedError: a pad moved or was loaded, or the source ended too soon.
         DeviceError: no scan arrived for a long time, or no whole new one of a sensor.
         LinkLostError: the link is lost.
-        UsageError: the number of scans is out of range, or a stream reads the source.
+        UsageError: a stream reads the source.
     """
-    check_whole("scans", scans, FEWEST_RECORDED if source.kind == "replay" else FEWEST_SCANS)
-    check_whole("skip", skip, 0)
     source.reserve()
     clock = (lambda: math.nan) if source.kind == "replay" else time.time  # never today's, of an old file
-    skipped: dict[str, int] = {}
+    came: dict[str, int] = {}  # scans of each sensor
     estimators: dict[str, BaselineEstimator] = {}
     baselines: dict[str, Baseline] = {}
     whole_s: dict[str, float] = {}
     received_s = clock_s()
-    with progress("zeroing", skip + scans, "scan") as bar:
-        while not (baselines and baselines.keys() == skipped.keys()):
+    with progress("zeroing", FEWEST_SCANS, "scan") as bar:
+        while not (baselines and baselines.keys() == came.keys()):
             if stop is not None and stop.is_set():
                 raise BaselineRefusedError("stopped before every sensor was zeroed: nothing is kept")
             taken = source.take(POLL_S)
             if taken is None:
-                raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor")
+                raise BaselineRefusedError(f"the source ended before {FEWEST_SCANS} complete scans of every sensor")
             now_s = clock_s()
             if any(isinstance(arrival, Scan) for arrival in taken):
                 received_s = now_s
@@ -63,21 +57,21 @@ def take_baselines(
                         estimators.clear()  # the sensor may read differently after the gap
                     continue
                 name = arrival.sensor
-                skipped[name] = skipped.get(name, -1) + 1
+                came[name] = came.get(name, 0) + 1
                 if name not in whole_s or (arrival.complete and not arrival.repeated):
                     whole_s[name] = now_s
-                if skipped[name] < skip or name in baselines:
+                if name in baselines:
                     continue
-                estimator = estimators.setdefault(name, BaselineEstimator(scans, clock=clock))
+                estimator = estimators.setdefault(name, BaselineEstimator(FEWEST_SCANS, clock=clock))
                 try:
                     baseline = estimator.push(arrival)
                 except BaselineRefusedError as refusal:
                     raise BaselineRefusedError(f"sensor {name}: {refusal}") from refusal
                 if baseline is not None:
                     baselines[name] = baseline
-            for name in skipped.keys() - baselines.keys():
+            for name in came.keys() - baselines.keys():
                 if now_s - whole_s[name] > GIVEN_UP_S:  # a taxel or the sensor is silent, while scans come
                     lack = f"no whole new scan from sensor {name} for {GIVEN_UP_S:.0f} s"
                     raise DeviceError(f"{lack}: edge-sr doctor shows what is wrong")
-            bar.update(min(skip + scans, 1 + min(skipped.values(), default=-1)) - bar.n)
+            bar.update(min(FEWEST_SCANS, min(came.values(), default=0)) - bar.n)
     return baselines

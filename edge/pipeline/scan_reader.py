@@ -50,13 +50,12 @@ class Source:
         *links: Link,
         sensor_file: SensorFile | None = None,
         rate_hz: float | None = None,
-        force: bool = False,
         give_up_s: float = 0.0,
     ) -> None:
         """Prepare to read one or more links that are not open yet; this source opens and closes them.
 
-        With `force` other scans, too, get properties that the sensor file has from an emulated sensor. A lost link is
-        opened again; `give_up_s` is the longest time that one may be away, in [s], and at 0 its first loss is raised.
+        A lost link is opened again; `give_up_s` is the longest time that one may be away, in [s], and at 0 its first
+        loss is raised.
 
         Raises:
             SourceError: some are emulated and some are not: results of both kinds must not be mixed.
@@ -69,7 +68,6 @@ class Source:
         self.states_poses = any(link.states_poses for link in links)
         self.sensor_file = SensorFile() if sensor_file is None else sensor_file
         self.rate_hz = rate_hz
-        self._force = force
         self.overruns = 0
         self.pace = ReadingPace()
         self._stop = threading.Event()
@@ -113,7 +111,7 @@ class Source:
             for reader in self._readers:
                 opening.enter_context(reader)
             kind = _one_kind([reader.link for reader in self._readers])  # some know their kind only now
-            refuse_emulated(self.sensor_file, kind, self.origin, self._force)
+            refuse_emulated(self.sensor_file, kind, self.origin)
             if not self.patient:
                 opening.callback(self._end_reading)
                 self._threads = [self._started(reader) for reader in self._readers]

@@ -115,17 +115,16 @@ class TestMarks:
 EMULATED = SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, emulated=frozenset({"baseline"}))})
 
 
-def test_a_device_refuses_an_emulated_sensor_unless_forced():
-    words = r"has baseline of an emulated sensor 4, and this is a device: .*--force"
+def test_a_device_refuses_an_emulated_sensor():
+    words = r"has baseline of an emulated sensor 4, and this is a device: .*edge-sr doctor --out"
     with (
         pytest.raises(SensorFileError, match=words),
         Source(FakeLink([], kind="device"), sensor_file=EMULATED),
     ):
         pass
-    for kind, force in (("device", True), ("emulated", False)):
-        with Source(FakeLink([], kind=kind), sensor_file=EMULATED, force=force):
-            pass
-    refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", None, force=False)
+    with Source(FakeLink([], kind="emulated"), sensor_file=EMULATED):
+        pass
+    refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", None)
 
 
 @pytest.mark.parametrize(

@@ -148,17 +148,6 @@ def test_everything_is_listed_adapters_first(plugged, gs_usb, capsys):
     assert "  --source gs_usb\n  ! no permission: " in out and "udev" in out and err == ""
 
 
-def test_for_programs(plugged, gs_usb, capsys):
-    plugged[:] = [VSCOM]
-    assert cli.main(["devices", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["notes"] == [] and [one["source"] for one in told["devices"]] == ["slcan:serial=D30BL366"]
-    assert Found(**told["devices"][0])._replace(problems=()) == serial_devices([VSCOM])[0]._replace(problems=())
-    plugged.clear()
-    assert cli.main(["devices", "--json"]) == 3
-    assert json.loads(capsys.readouterr().out) == {"devices": [], "notes": []}
-
-
 def test_usb_that_cannot_be_read_hides_no_port(plugged, gs_usb, capsys, monkeypatch):
     why = "libusb cannot be loaded: pip install libusb-package"
 
