@@ -91,7 +91,7 @@ def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     source = open_recording(
         *files,
         sensor=options.sensor,
-        zero=options.zero or options.baseline is not None,
+        zero=options.baseline is not None,
         paced=paced,
         rate_hz=options.rate_hz,
         bar=not paced and "status" not in options.sink,
