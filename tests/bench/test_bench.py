@@ -3,20 +3,17 @@
 import csv
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 
-import hot_path
 import numpy as np
 import program_cost
 import pytest
 from cli_samples import run
 from edge_samples import ROOT, make_contract, wait_for, write_model
-from program_cost import Ratio, ratio_of
 
 from edge.bench import command
 from edge.bench import provenance as reports
@@ -247,21 +244,6 @@ def test_ticks_whose_run_is_not_done_in_time_are_missed(took_ms, ticks, done, mi
     assert found.times.max_us == 1e3 * max(took_ms)
 
 
-def test_a_machine_that_halts_at_once_still_gives_a_figure():
-    clock = Clock()
-    run, numbers = clock.work(1)
-    asked = []
-
-    def stalls():
-        asked.append(clock.now_ns)
-        clock.now_ns += 1_000_000_000 * (len(asked) == 3)  # before the first tick is waited for
-        return clock.now_ns
-
-    found = paced(run, 100.0, 10, stalls, clock.sleep, cpu_clock=lambda: 0)
-    assert (found.times.runs, numbers) == (1, [10])
-    assert found.missed == 10
-
-
 @pytest.mark.parametrize(
     ("took_ms", "most", "runs"), [(1, 3000, 2000), (0.1, 3000, 3000), (200, 3000, 90), (200, 10, 10)]
 )
@@ -276,36 +258,6 @@ def test_back_to_back_is_as_many_runs_as_fit(took_ms, most, runs):
 def test_the_front_is_who_is_not_beaten():
     points = [(9.0, 100.0), (5.0, 60.0), (2.0, 700.0), (2.0, 800.0), (1.9, 900.0), (5.0, 60.0)]
     assert front(points) == [False, True, True, False, True, True]
-
-
-def test_a_way_that_takes_longer_than_the_one_before_is_red(tmp_path, limits, capsys):
-    """The tree before is this one, without the work that the change adds to each scan."""
-    for package in ("edge", "firmware_bridge"):
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    changed = tmp_path / "firmware_bridge/scans/slcan_scans.py"
-    text = changed.read_text()
-    begin = "        scans: list[Scan] = []\n"
-    assert text.count(begin) == 1
-    changed.write_text(text.replace(begin, f"{begin}        sum(range(40_000))\n"))
-    limits(hot_path, BLOCKS=3)
-    ratio, took_us = hot_path.compare(tmp_path, ROOT, pairs=1)["at rest"]
-    assert hot_path.slower(ratio) and took_us > 0
-    assert (
-        hot_path.report({"at rest": (ratio, took_us)}, "HEAD~1") == 1
-        and ": more than a tenth slower" in capsys.readouterr().out
-    )
-    assert not hot_path.slower(Ratio(1.05, 1.04, 1.06)) and not hot_path.slower(Ratio(1.2, 0.9, 1.4))
-
-
-def test_a_commit_that_cannot_be_run_is_named_and_is_not_red(capsys):
-    assert hot_path.main(["no-such-commit"]) == 0
-    assert "no-such-commit: fatal" in capsys.readouterr().out
-
-
-def test_pairs_are_drawn_together_so_that_common_noise_cancels():
-    weather = np.random.default_rng(3).uniform(1, 3, 30)
-    paired = ratio_of(2 * weather, weather)
-    assert (paired.ratio, paired.low, paired.high) == pytest.approx((2, 2, 2)) and str(paired) == "2 (2..2)"
 
 
 def test_the_programs_cost_is_a_line_for_rest_and_for_contact(limits, capsys):

@@ -41,6 +41,7 @@ TAPS_SCANS = 460
 
 PARSED = {
     r"edge-sr bench .*": "measures for minutes; test_bench runs it",
+    r"edge-sr doctor --rehearse": "takes twenty seconds; test_doctor_command runs it",
     r"edge-sr models --measure": "measures run times for seconds; test_cli runs it",
     r"edge-sr --source demo:loop --sink ros2:.*": "goes on until it is ended; test_ros2 subscribes to its topics",
     r"edge-sr (replay \S+ )?--sink rerun:view": "opens a viewer; test_rerun sends to the package's interface",
@@ -52,7 +53,7 @@ PARSED = {
     r"python tests/system/chaos_wire\.py .*": "plays until ended; test_chaos runs it",
     r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
     r"python tests/system/program_cost\.py.*": "takes a minute; test_bench runs it, shortened",
-    r"python tests/system/hot_path\.py.*": "takes ten seconds; .ci/run runs it, and test_bench",
+    r"python tests/system/hot_path\.py.*": "takes ten seconds; .ci/run runs it",
     r"edge-sr (record |replay |--source replay:)FILE(\.\.\.)?( --view)?": "a name to be filled in; press.mcap is run",
     r"edge-sr replay --example --view": "waits for who looks; test_view_page_recordings looks at a recording",
 }

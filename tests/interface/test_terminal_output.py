@@ -5,16 +5,14 @@ import fcntl
 import io
 import os
 import re
-import signal
 import struct
 import subprocess
 import termios
-import threading
 from types import SimpleNamespace
 
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import wait_for, write_model
+from edge_samples import write_model
 
 from edge.cli import main as cli
 from edge.terminal import progress_bar
@@ -102,26 +100,6 @@ def test_nothing_without_a_terminal_or_beyond_torchruns_first(terminal, monkeypa
             clock.now_s += 9
             bar.update()
     assert pipe.getvalue() == terminal.said() == ""
-
-
-def test_zeroing_shows_its_bar_and_leaves_no_trace_when_stopped(tmp_path, limits, terminal):
-    """`edge-sr baseline` of a slow sensor, stopped by Ctrl-C."""
-    limits(progress_bar, DELAY_S=0)
-    said = []
-
-    def stop():
-        wait_for(lambda: said.append(terminal.said()) or RATE.search("".join(said)))
-        os.kill(os.getpid(), signal.SIGINT)
-
-    stopping = threading.Thread(target=stop)
-    stopping.start()
-    with contextlib.redirect_stderr(terminal.stream):
-        words = ["baseline", "--source", "demo", "--out", str(tmp_path / "zero.json"), "--rate-hz", "5"]
-        assert cli.main(words) == 3
-    stopping.join()
-    shown = "".join(said) + terminal.said()
-    assert re.search(r"zeroing: +\d+%\|", shown)
-    assert re.search(r"\r +\redge-sr: stopped before every sensor was zeroed", shown)
 
 
 ODD = ["a  b", "it's", "a;b$c`d", "tab\there\nthere", "\x1b[31mred", "back\\slash\x1b", "\x9b\u202eé", "\udcff"]
