@@ -4,7 +4,7 @@ from itertools import pairwise
 import cli_samples
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeLink, FakeModel, make_scan
+from edge_samples import FakeLink, FakeModel
 from pose_samples import make_posed_contract, write_posed_model
 from trust_samples import make_posed_trust
 
@@ -18,86 +18,55 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 from train.demo import TAP_FRAMES
 
-PRESSES = [0, 0, 2000, 3000, 3500, 0, 2100, 4000, 0]
-TAPS = [-1, -1, 0, 0, -1, -1, 1, 1, -1]
+
+@pytest.fixture(scope="module")
+def demo():
+    with np.load(demo_recording()) as data:
+        return dict(data)
 
 
-@pytest.fixture
-def recording(tmp_path):
-    counts = np.stack([make_scan(n, press_counts=press, noise=2).counts for n, press in enumerate(PRESSES)])
-    unit_patterns = np.stack([np.kron(np.eye(4), np.ones((10, 10))), np.ones((40, 40))]).astype(np.float16)
-    path = tmp_path / "demo.npz"
-    np.savez(
-        path,
-        counts=counts,
-        tap=np.array(TAPS),
-        indentation_mm=np.arange(len(TAPS)) / 8,
-        unit_patterns=unit_patterns,
-        tap_pose=np.array([[0, 0, 0, 0.2, 1], [0, 0, -5, 0.2, 1]]),
-        scene=np.full(len(TAPS), -1),
-        surface=np.array("S"),
-    )
-    return path
+def play(demo, lost=()):
+    """Return the scores of the demo without some of its scans, a tiny model, and notes of the scenes."""
+    recording, model, events = DemoRecording(demo_recording()), FakeModel(), []
+    score, scenes = DemoScore(recording, model), DemoScenes(recording, events.append, lambda: None)
+    runtime, series = Runtime(model, source="emulated"), ScanSeries("4", USPA44)
+    for n, counts in enumerate(demo["counts"][: np.argmax(demo["scene"] == SLIDE) + 1]):
+        if n not in lost:
+            result = runtime.push(series.close(counts.copy(), n * 10_000_000))
+            score.add(result)
+            scenes.add(result)
+    assert score.complete
+    return score.scores(), model, events
 
 
-def play(recording, *, lost=(), model=None):
-    """Return the score of a recording."""
-    model = model or FakeModel()
-    score = DemoScore(DemoRecording(recording), model)
-    runtime, series = Runtime(model, source="emulated", baselines={"4": BASELINE}), ScanSeries("4", USPA44)
-    with np.load(recording) as data:
-        shown = data["counts"]
-    for index, counts in enumerate(shown):
-        if index not in lost:
-            score.add(runtime.push(series.close(counts.copy(), index * 10_000_000)))
-    return score
+def test_each_tap_is_scored_at_its_peak_by_that_frames_truth(demo):
+    scores, model, events = play(demo)
+    assert [(one.tap, one.pose) for one in scores] == [(tap, (0, 0, -5 * tap)) for tap in range(4)]
+    assert [one.result.taps_used for one in scores] == [1, 2, 3, 4]
+    for one in scores:
+        truth = demo["unit_patterns"][one.tap] * demo["indentation_mm"][demo["tap"] == one.tap].max()
+        np.testing.assert_allclose(one.truth, truth, rtol=1e-3)
+        assert one.psnr_db == pytest.approx(float(psnr_db(one.result.pattern, truth, 2.0)), abs=1e-3)
+        newest = model.contract.scale_window(one.result.window[:1])
+        alone = model.run(np.stack([*newest, *np.zeros((3, 3, 4, 4))], dtype="f4"))
+        for percent, pattern in ((one.rmse_percent, one.result.pattern), (one.alone_percent, alone)):
+            assert percent == pytest.approx(float(rmse_percent(pattern, truth, 2.0)), abs=1e-3)
+    assert [(one.alone_percent == one.rmse_percent) for one in scores] == [True, False, False, False]
+    begun = ["demo: now another surface", "demo: now a magnet comes", "demo: now the pad slides"]
+    assert [event.text[: len(words)] for event, words in zip(events, begun, strict=True)] == begun
 
 
-def test_each_tap_is_scored_at_its_peak_by_that_frames_truth(recording):
-    model = FakeModel()
-    first, second = play(recording, model=model).scores()
-    assert (first.tap, first.pose, second.tap, second.pose) == (0, (0, 0, 0), 1, (0, 0, -5))
-    assert (first.result.taps_used, second.result.taps_used) == (1, 2)
-    for got, frame, unit in ((first, 3, np.kron(np.eye(4), np.ones((10, 10)))), (second, 7, np.ones((40, 40)))):
-        assert got.result.force_counts == pytest.approx(PRESSES[frame], abs=40)
-        truth = unit * frame / 8
-        np.testing.assert_allclose(got.truth, truth)
-        assert got.psnr_db == pytest.approx(float(psnr_db(got.result.pattern, truth, 2.0)))
-        assert got.rmse_percent == pytest.approx(float(rmse_percent(got.result.pattern, truth, 2.0)))
-    newest = model.contract.scale_window(second.result.window[:1])
-    alone = model.run(np.stack([*newest, np.zeros((3, 4, 4))], dtype="f4"))
-    assert second.alone_percent == pytest.approx(float(rmse_percent(alone, second.truth, 2.0)))
-    assert second.alone_percent != second.rmse_percent and first.alone_percent == first.rmse_percent
-
-
-def test_a_lost_scan_shifts_nothing(recording):
-    whole, gappy = play(recording).scores(), play(recording, lost=(0, 2, 5)).scores()
-    assert [s.truth.tobytes() for s in gappy] == [s.truth.tobytes() for s in whole]
+def test_a_lost_scan_shifts_nothing(demo):
+    whole, gappy = play(demo)[0], play(demo, lost=(110, 152, 175, 176, 250))[0]
+    assert [one.truth.tobytes() for one in gappy] == [one.truth.tobytes() for one in whole]
     assert gappy[0].result.scan.number != whole[0].result.scan.number
 
 
-def test_each_scene_is_announced(recording, tmp_path):
-    with np.load(recording) as data:
-        arrays = dict(data)
-    np.savez(tmp_path / "scenes.npz", **arrays | {"scene": np.array([-1, -1, 0, 0, 0, -1, 1, 1, -1])})
-    runtime, series = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE}), ScanSeries("4", USPA44)
-    results = [runtime.push(series.close(counts.copy(), n * 10_000_000)) for n, counts in enumerate(arrays["counts"])]
-    events = []
-    scenes = DemoScenes(DemoRecording(tmp_path / "scenes.npz"), events.append, lambda: pytest.fail("no other object"))
-    for result in results:
-        scenes.add(result)
-    assert [(event.kind, event.text[:24]) for event in events] == [
-        ("note", "demo: now another surfac"),
-        ("note", "demo: now a magnet comes"),
-    ]
-
-
-def test_the_bundled_model_drops_foreign_taps_and_flags_a_magnet():
+def test_the_bundled_model_drops_foreign_taps_and_flags_a_magnet(demo):
     runtime = Runtime(load_model(POSED_MODEL), source="emulated", options=RuntimeOptions(every_scan=True))
     series = ScanSeries("4", USPA44)
-    with np.load(demo_recording()) as demo:
-        before = np.argmax(demo["scene"] == SLIDE)
-        counts, tap, scene = (demo[name][:before] for name in ("counts", "tap", "scene"))
+    before = np.argmax(demo["scene"] == SLIDE)
+    counts, tap, scene = (demo[name][:before] for name in ("counts", "tap", "scene"))
     stated, results = [*load_recording(demo_recording()).poses], []
     for n, one in enumerate(counts):
         while stated[0].time_ns <= n * 10_000_000:
@@ -128,10 +97,9 @@ def posed(tmp_path_factory):
     return str(path)
 
 
-def test_a_looping_demo_is_scored_once_and_begins_each_pass_anew(posed, tmp_path, capfd):
+def test_a_looping_demo_is_scored_once_and_begins_each_pass_anew(demo, posed, tmp_path, capfd):
     """The demo's own scans, twice, from a link that waits for its reader: no machine is too slow for it."""
-    with np.load(demo_recording()) as demo:
-        tap_of, counts = demo["tap"], demo["counts"].astype(np.int32)
+    tap_of, counts = demo["tap"], demo["counts"].astype(np.int32)
     poses = load_recording(demo_recording()).poses
     series, path = ScanSeries("4", USPA44), tmp_path / "out.jsonl"
     link = FakeLink([[series.close(one, n * 10_000_000)] for n, one in enumerate([*counts, *counts])], kind="emulated")
