@@ -21,7 +21,7 @@ from edge_samples import FakeLink
 from edge.api import load_sensor_file
 from edge.cli import main as cli
 from edge.cli.main import parser
-from edge.doctor import command, examine
+from edge.doctor import command, examine, rehearsal
 from edge.doctor.guided_press import ASK_WEIGHT, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
@@ -149,7 +149,8 @@ def test_a_scale_of_mistyped_grams_is_not_kept(tmp_path):
     assert entry.counts_per_newton is entry.counts_per_newton_interval is None
 
 
-def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path):
+def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path, limits):
+    limits(rehearsal, ANSWER_S=0.1)
     file, out, err = tmp_path / "practice.toml", io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         code = cli.main(["doctor", "--rehearse", "--out", str(file)])

@@ -163,12 +163,6 @@ def test_what_is_not_known_is_not_well(verdicts, words):
     assert summary([Finding("noise", verdict, "") for verdict in verdicts]) == words
 
 
-def test_the_last_line_says_it():
-    code, page = told()
-    findings = [line for line in page.splitlines() if line.startswith("  ?")]
-    assert code == 0 and page.splitlines()[-1] == f"nothing wrong, {len(findings)} not known" and len(findings) == 2
-
-
 @pytest.mark.parametrize("name", ["no/such/s.toml", "", "/proc/s.toml"])
 def test_an_unwritable_file_is_refused_before_anything_is_opened(tmp_path, name):
     def open_link():

@@ -5,14 +5,16 @@ import fcntl
 import io
 import os
 import re
+import signal
 import struct
 import subprocess
 import termios
+import threading
 from types import SimpleNamespace
 
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import write_model
+from edge_samples import wait_for, write_model
 
 from edge.cli import main as cli
 from edge.terminal import progress_bar
@@ -100,6 +102,22 @@ def test_nothing_without_a_terminal_or_beyond_torchruns_first(terminal, monkeypa
             clock.now_s += 9
             bar.update()
     assert pipe.getvalue() == terminal.said() == ""
+
+
+def test_ctrl_c_ends_zeroing_and_its_bar(tmp_path, limits, terminal):
+    limits(progress_bar, DELAY_S=0)
+    said = []
+
+    def stop():
+        wait_for(lambda: said.append(terminal.said()) or "zeroing:" in "".join(said))
+        signal.raise_signal(signal.SIGINT)
+
+    stopping = threading.Thread(target=stop)
+    stopping.start()
+    with contextlib.redirect_stderr(terminal.stream):
+        assert cli.main(["baseline", "--source", "demo", "--rate-hz", "5", "--out", str(tmp_path / "zero.json")]) == 3
+    stopping.join()
+    assert re.search(r"\r +\redge-sr: stopped before every sensor was zeroed", "".join(said) + terminal.said())
 
 
 ODD = ["a  b", "it's", "a;b$c`d", "tab\there\nthere", "\x1b[31mred", "back\\slash\x1b", "\x9b\u202eé", "\udcff"]
