@@ -1,7 +1,6 @@
 """Demo: an emulated sensor on an emulated robot, read over its pseudo-terminal."""
 
 from collections import deque
-from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -47,7 +46,7 @@ class DemoLink(SlcanSerialLink):
             raise DeviceError(f"the emulator did not start: {error}") from error
         rate_hz = recording.rate_hz or 0.0
         self._poses = {round(pose.time_ns * rate_hz / 1e9): pose for pose in recording.poses}
-        self._length, self.emulator = len(recording.tracks[0].counts), emulator
+        self._length, self._sent, self.emulator = len(recording.tracks[0].counts), 0, emulator
         emulator.__enter__()
         self._plugged = PluggedAdapter(emulator.port)
         try:
@@ -84,4 +83,4 @@ class DemoLink(SlcanSerialLink):
         pose = self._poses.get(self._sent % self._length)
         self._sent += 1
         if pose is not None:
-            self._stated.append(replace(pose, time_ns=time_ns))
+            self._stated.append(TimedPose(pose.pose, time_ns, holds=pose.holds))
