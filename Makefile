@@ -48,7 +48,7 @@ reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each co
 	$(REPORT) -m train.experiments all
 	$(REPORT) -m export.stability
 	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md
-	$(BIN)/edge-sr bench --threads 1 --out reports
+	$(BIN)/edge-sr bench --out reports
 	$(REPORT) tests/support/wire_faults.py --out reports/wire-faults.md
 	$(REPORT) tests/system/mutation_survey.py --out reports/mutation.md
 

@@ -319,7 +319,6 @@ Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong 
                 Option("--out DIR", Path, "folder for bench.csv and bench.md"),
                 Option("--rate-hz R", positive, "paced ticks a second (default 100)", default=100.0),
                 Option("--ticks N", whole(10), "paced ticks a row (default 3000)", default=3000),
-                Option("--threads N", whole(1), "numbers of threads (default 1 2)", nargs="+", default=[1, 2]),
                 Option("--models DIR", Path, "folder of your own models, measured as well"),
                 Option("--only NAME", str, "measure only these methods", nargs="+"),
             ),
