@@ -53,7 +53,7 @@ class DemoScenes:
     """Announcement of each scene of the demo, as events of kind "note"."""
 
     def __init__(self, recording: DemoRecording, tell: Callable[[Event], object], reset: Callable[[], object]) -> None:
-        """Begin before the first scene; `reset` is called where the robot goes on to another object."""
+        """Begin before the first scene; `reset` is called where the robot goes to another object and back."""
         self._recording, self._tell, self._reset = recording, tell, reset
         self._scene = FREE
 
@@ -62,11 +62,11 @@ class DemoScenes:
         scene = self._recording.scenes.get(_key(result.scan.counts), self._scene)
         if scene == self._scene:
             return
+        if SLIDE in (scene, self._scene):
+            self._reset()
         self._scene = scene
         if scene in _BEGINS:
             self._tell(Event(time.monotonic_ns(), "note", None, f"demo: {_BEGINS[scene]}"))
-        if scene == SLIDE:
-            self._reset()
 
 
 @dataclass(frozen=True, slots=True)

@@ -229,9 +229,6 @@ def run(
                 watching = [messages, *(() if view is None else view.sinks)]
                 played = demo.Demo(model, scores, view, watching, commands, loops=loops, maps=mapping is None)
                 asked = replace(asked, every_scan=True)  # it shows the run time of every scan
-            if loops:
-                # After 100 scans without contact it is at its first tap: 180 lie before it, 34 between taps.
-                asked = replace(asked, idle_reset_s=min(100 / (options.rate_hz or 100.0), asked.idle_reset_s))
             settings = {"baselines": baselines, "counts_per_newton": options.counts_per_newton}
             runtime = open_runtime(model, source, **settings, **asdict(asked))
             give_back_memory()
