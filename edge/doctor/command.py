@@ -33,7 +33,6 @@ from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, stored_baselines
 from edge.terminal.argument_types import columns, wrapped
-from edge.terminal.progress_bar import progress
 from edge.terminal.stop_signals import stop_on_signals
 from firmware_bridge import in_place
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError, as_typed, harmless
@@ -88,14 +87,7 @@ class Visit:
         """Watch the link while the pads are free; raises LinkLostError."""
         length_s = self._options.drift_s if self._rehearsal is None else WATCHED_S
         self._say(f"{self._link.name}: watching for {length_s:g} s; keep the pad free and still")
-        with progress("watching", length_s, "s", stream=self._err) as bar:
-
-            def show(scans: int, passed_s: float) -> None:
-                if passed_s > 0:
-                    bar.set_postfix_str(f"{scans / passed_s:.0f} scans/s", refresh=False)
-                bar.update(min(passed_s, length_s) - bar.n)
-
-            watch(self._reader, watched, length_s, self._stop, tell=show)
+        watch(self._reader, watched, length_s, self._stop)
 
     def press(self, names: Sequence[str], examined: Examined) -> None:
         """Ask for presses on every pad that may be zeroed, and add what is found; raises LinkLostError."""
