@@ -8,10 +8,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, TextIO, TypeVar
+from typing import Any, Final, TextIO
 
 import numpy as np
 
@@ -28,10 +28,8 @@ from edge.bench.subjects import (
 )
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
-from edge.terminal.progress_bar import progress
 
 _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
-_Thing = TypeVar("_Thing")
 
 
 class BenchError(EdgeError, RuntimeError):
@@ -39,17 +37,16 @@ class BenchError(EdgeError, RuntimeError):
 
 
 class BenchPage:
-    """Page of `lines` that are shown at once and kept; a progress bar makes room for them."""
+    """Page of `lines` that are shown at once and kept."""
 
     def __init__(self, out: TextIO, err: TextIO) -> None:
         self.lines: list[str] = []
         self._out, self._err = out, err
-        self._bar: Any = None
 
     def say(self, text: str) -> None:
         """Show a line, or several, and keep it."""
         self.lines.append(text)
-        self._write(self._out, text)
+        print(text, file=self._out, flush=True)
 
     def row(self, cells: Iterable[str]) -> None:
         """Show a row of the table, and keep it."""
@@ -63,21 +60,7 @@ class BenchPage:
 
     def warn(self, text: str) -> None:
         """Show a line on stderr."""
-        self._write(self._err, f"edge-sr: {text}")
-
-    def tracked(self, things: Sequence[_Thing], what: str) -> Iterator[_Thing]:
-        """Yield the things, one after the other, with a progress bar."""
-        with progress(what, len(things), "row", stream=self._err) as self._bar:
-            for thing in things:
-                yield thing
-                self._bar.update()
-        self._bar = None
-
-    def _write(self, stream: TextIO, text: str) -> None:
-        if self._bar is not None:
-            self._bar.clear()
-        stream.write(text + "\n")
-        stream.flush()
+        print(f"edge-sr: {text}", file=self._err, flush=True)
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
@@ -130,7 +113,7 @@ def _errors(
     columns = ("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %")
     page.section("Error", text, (*columns, "force error %"))
     rows: list[ErrorRow] = []
-    for subject in page.tracked(everyone, "error"):
+    for subject in everyone:
         try:
             for row in error_rows(subject, frozen):
                 rows.append(row)
@@ -168,7 +151,7 @@ def _run_times(
     )
     page.section("Run time", text, (*columns, "start-up ms", "MB"))
     window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
-    for subject in page.tracked(everyone, "run times"):
+    for subject in everyone:
         job = {"subject": subject._asdict(), "threads": 1}
         starts = 5 if options.ticks >= 300 else 1
         start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, starts)
