@@ -15,8 +15,7 @@ from firmware_bridge.links.discovery import Found, devices
 from firmware_bridge.schedule import Ticker
 
 RATE_HZ: Final = 100.0
-ROUNDS: Final = 3  # in which the models take turns, so that a bad second of a shared host falls on no model alone
-TICKS: Final = 50
+TICKS: Final = 150
 NOTHING = (
     "no adapter found: check both plugs of a VScom (the second is the sensor's power), the lines of `dmesg` since "
     "it was plugged in, and that this user is in the group dialout"
@@ -50,7 +49,7 @@ def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         out.write(f"{cells}{figures}{times}{default}\n")
     out.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
     if took_us:
-        out.write(f"run times of {ROUNDS * TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
+        out.write(f"run times of {TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
 
 
 def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
@@ -58,19 +57,20 @@ def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
 
     Windows are random, with all taps: run time does not depend on their values.
     """
-    rng, took_us = np.random.default_rng(1), np.zeros((len(models), ROUNDS, TICKS))
-    for turn, model in enumerate(tracked([*models] * ROUNDS, "run times", "model")):
+    rng, made = np.random.default_rng(1), list[tuple[float, float]]()
+    for model in tracked(models, "run times", "model"):
         contract = model.contract
         shape = (16, contract.taps, 3, contract.rows, contract.cols)
         windows = (rng.standard_normal(shape) * 1000).astype(np.float32)
-        ticker = Ticker(RATE_HZ)
+        ticker, took_us = Ticker(RATE_HZ), list[float]()
         for tick in range(TICKS):
             ticker.wait()
             start_ns = time.perf_counter_ns()
             model.run(contract.scale_window(windows[tick % len(windows)]))
-            took_us[turn % len(models), turn // len(models), tick] = (time.perf_counter_ns() - start_ns) / 1e3
-    both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")
-    return [(float(p50), float(p99)) for p50, p99 in both.T]
+            took_us.append((time.perf_counter_ns() - start_ns) / 1e3)
+        p50, p99 = np.percentile(took_us, [50, 99], method="inverted_cdf")
+        made.append((float(p50), float(p99)))
+    return made
 
 
 def show_devices(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
