@@ -47,7 +47,7 @@ REPORT := nice $(BIN)/python
 reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each command stands alone, too
 	$(REPORT) -m train.experiments all
 	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md
-	$(BIN)/edge-sr bench --threads 1 --out reports
+	$(BIN)/edge-sr bench --out reports
 	$(REPORT) tests/system/mutation_survey.py --out reports/mutation.md
 
 reports-stale: $(VENV)/.dev  ## a line for each report: fresh, or stale and why

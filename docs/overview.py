@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db
 from edge.inference.bundled import POSED_MODEL, demo_recording, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.terminal.heatmap import colours
+from edge.mapping.colours import colours
 
 SIDE_PX: Final = 180
 SMALL_PX: Final = 80

@@ -107,7 +107,6 @@ def open_source(
     id_map: str | ModelMap | None = None,
     rate_hz: float | None = None,
     give_up_s: float = math.inf,
-    force: bool = False,
 ) -> Source:
     """Return a source of scans for a with statement; it reopens links that are lost while it is open.
 
@@ -121,7 +120,6 @@ def open_source(
         rate_hz: rate at which a recording is played; for a device, the rate that sets the deadlines of its patterns,
             in [Hz].
         give_up_s: longest time that a lost or silent source may be away, in [s]; at 0 its loss is an error at once.
-        force: use a sensor file of an emulated sensor on other scans, too, which opening the source refuses otherwise.
 
     Raises:
         SourceError: the form does not exist, a name occurs twice, or the sources are of several kinds.
@@ -134,4 +132,4 @@ def open_source(
     if not give_up_s >= 0:
         raise UsageError(f"give_up_s is {give_up_s}, expected 0 or more")
     links, sensor_file = links_to(texts, sensor_settings(sensor, id_map), rate_hz)
-    return Source(*links, sensor_file=sensor_file, rate_hz=rate_hz, force=force, give_up_s=give_up_s)
+    return Source(*links, sensor_file=sensor_file, rate_hz=rate_hz, give_up_s=give_up_s)

@@ -1,9 +1,7 @@
 """Recordings as a controller would send them: of the demo, and of two fingers that grip things.
 
-In the demo a surface is tapped, another one among these taps, a magnet comes near, and the pad slides. The first four
-taps follow the paper's schedule. For each of them but the first there are options as well: taps at the poses that three
-proposals of half a pitch can lead to, of which an emulated robot plays those that are proposed. The grips have noise,
-drift, gains and uneven pads of real sensors.
+In the demo a surface is tapped by the paper's schedule, another one among these taps, a magnet comes near, and the pad
+slides. The grips have noise, drift, gains and uneven pads of real sensors.
 """
 
 import math
@@ -25,11 +23,11 @@ from train.physics.contact import BARE
 from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad, Taps, between_frames
 from train.physics.magnets import Magnet, dipole_mt
 from train.physics.pad_draws import NOMINAL, draw_pad
-from train.physics.sensor_noise import Nuisances, apply_nuisances, jitter_poses
+from train.physics.sensor_noise import Nuisances, apply_nuisances
 from train.physics.tpsf import resample
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, figure
-from train.surfaces.poses import ANGLE_STEP_DEG, HALF_PITCH_MM, PLACES_MM, over_surface
+from train.surfaces.poses import ANGLE_STEP_DEG, PLACES_MM
 
 SURFACE: Final = "glyph:1"
 """A random figure, which no network was trained on: of those of the paper one tap shows nearly all."""
@@ -46,10 +44,6 @@ MAGNET_FRAMES, MAGNET_ALONE_FRAMES = 80, 30
 _TOWARDS: Final = (0.5, -0.3, 0.8)
 _MOMENT: Final = (-0.3, -0.8, 0.5)
 FOREIGN_SCENE, MAGNET_SCENE, SLIDE_SCENE = 0, 1, 2
-OPTIONS_MM: Final = HALF_PITCH_MM * np.array(
-    [(x, y) for y in range(1 - TAPS, TAPS) for x in range(1 - TAPS, TAPS)], dtype=np.float64
-)
-"""Places of the options in the first tap's axes: each tap may be proposed half a pitch from the one before."""
 LETTER_WIDTH_MM, LETTER_Y_MM, LETTER_PX_PER_MM = 14.0, 60.0, 4.0
 """Width of the long letter, which one lane of the pad covers, and its place in the object's plane, beside the taps."""
 FIGURE_MM: Final = 50.0  # longest side of the long letter
@@ -66,8 +60,7 @@ def demo_recording() -> dict[str, NDArray]:
 
     The pad rests, then presses, holds and lifts four times, turned a step each time, at the held-out position. In the
     scenes another surface is tapped before the next tap of the first one; then a magnet comes near the free pad, which
-    is tapped meanwhile, and leaves; then the pad slides over a long letter. Arrays `option_...` are of taps that may
-    take the place of those after the first.
+    is tapped meanwhile, and leaves; then the pad slides over a long letter.
     """
     pad = GrippedPad(NOMINAL)
     angles_deg = [ANGLE_DEG + step * ANGLE_STEP_DEG for step in range(1 - TAPS, 1)]
@@ -107,13 +100,12 @@ def demo_recording() -> dict[str, NDArray]:
         "counts": counts.astype(np.int32),
         "tap": np.where(share > 0, number, -1),
         "indentation_mm": (share * end_mm[number]).astype(np.float32),
-        "unit_patterns": _unit_patterns(taps),
+        "unit_patterns": resample(taps.unit_patterns, FINE_SCALE, SCALE).astype(np.float16),  # per mm
         "surface": np.array(SURFACE),
         "angles_deg": np.array(angles_deg),
         "tap_pose": np.array(tapped[:TAPS]),
         "scene": scene,
         **_poses(tapped, way, begins),
-        **_options(pad, rest),
         "letter": letter,
         "letter_px_per_mm": np.array(LETTER_PX_PER_MM),
         "letter_centre_mm": np.array((0.0, LETTER_Y_MM)),
@@ -142,24 +134,6 @@ def _poses(
         "pose_time_ns": (frame * 1e9 / RATE_HZ).astype(np.int64),
         "pose": np.array([*tapped, *way, way[-1]]),
         "pose_holds": holds,
-    }
-
-
-def _options(pad: GrippedPad, rest: NDArray[np.float32]) -> dict[str, NDArray]:
-    """Return the taps that may be proposed; the pad is where the robot states, but for the usual error."""
-    first = Pose(*_PLACE_MM, ANGLE_DEG + (1 - TAPS) * ANGLE_STEP_DEG)
-    wanted = [over_surface(first, float(x_mm), float(y_mm), 0.0) for x_mm, y_mm in OPTIONS_MM]
-    poses = jitter_poses(np.random.default_rng([SEED, 3]), wanted)
-    taps = tap(pad, [SURFACE] * len(poses), poses, FORCE_N)
-    course = _course()[:-GAP_FRAMES]
-    counts = between_frames(taps.counts, np.tile(course, (len(poses), 1)))
-    tap_s = len(course) / RATE_HZ
-    read = apply_nuisances(counts[None], _SENSOR, SEED, tap_s=tap_s)[0]
-    return {
-        "option_counts": (rest + read).astype(np.int32),
-        "option_pose": np.array([_stated(x_mm, y_mm, 0.0) for x_mm, y_mm in OPTIONS_MM.tolist()]),
-        "option_indentation_mm": (course * taps.indentation_mm[:, -1:]).astype(np.float32),
-        "option_unit_patterns": _unit_patterns(taps),
     }
 
 
@@ -222,11 +196,6 @@ def _pressed(
             pressed = pad.press(heights[meets], deep_mm[start + meets], drag, still, even, bare)
             counts[start + meets] = pressed.counts
     return counts
-
-
-def _unit_patterns(taps: Taps) -> NDArray[np.float16]:
-    """Return the truth per indentation, (n, H, W)."""
-    return resample(taps.unit_patterns, FINE_SCALE, SCALE).astype(np.float16)
 
 
 def _course() -> NDArray[np.float64]:

@@ -8,10 +8,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, TextIO, TypeVar
+from typing import Any, Final, TextIO
 
 import numpy as np
 
@@ -28,10 +28,8 @@ from edge.bench.subjects import (
 )
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
-from edge.terminal.progress_bar import progress
 
 _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
-_Thing = TypeVar("_Thing")
 
 
 class BenchError(EdgeError, RuntimeError):
@@ -39,17 +37,16 @@ class BenchError(EdgeError, RuntimeError):
 
 
 class BenchPage:
-    """Page of `lines` that are shown at once and kept; a progress bar makes room for them."""
+    """Page of `lines` that are shown at once and kept."""
 
     def __init__(self, out: TextIO, err: TextIO) -> None:
         self.lines: list[str] = []
         self._out, self._err = out, err
-        self._bar: Any = None
 
     def say(self, text: str) -> None:
         """Show a line, or several, and keep it."""
         self.lines.append(text)
-        self._write(self._out, text)
+        print(text, file=self._out, flush=True)
 
     def row(self, cells: Iterable[str]) -> None:
         """Show a row of the table, and keep it."""
@@ -63,21 +60,7 @@ class BenchPage:
 
     def warn(self, text: str) -> None:
         """Show a line on stderr."""
-        self._write(self._err, f"edge-sr: {text}")
-
-    def tracked(self, things: Sequence[_Thing], what: str) -> Iterator[_Thing]:
-        """Yield the things, one after the other, with a progress bar."""
-        with progress(what, len(things), "row", stream=self._err) as self._bar:
-            for thing in things:
-                yield thing
-                self._bar.update()
-        self._bar = None
-
-    def _write(self, stream: TextIO, text: str) -> None:
-        if self._bar is not None:
-            self._bar.clear()
-        stream.write(text + "\n")
-        stream.flush()
+        print(f"edge-sr: {text}", file=self._err, flush=True)
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
@@ -96,19 +79,18 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         raise UsageError(f"{where}: cannot be made: {error.strerror}: name a folder to write in") from error
     frozen = load_frozen_set(FROZEN_FILE)
     everyone = chosen(subjects(frozen.scale, options.models, page.warn), options.only)
-    threads = sorted(set(options.threads))
     # With fewer p99.9 rests on the longest few.
     few = "" if options.ticks >= 3000 else " (fewer than 3000: p99.9 and misses mean little)"
     date = datetime.now(UTC).isoformat(timespec="seconds")
     page.say(
         f"# Error against run time\n\n{date}, `{command}`\n\n{this_machine()}. {options.ticks} ticks a row at "
-        f"{options.rate_hz:g} Hz{few}; threads {' and '.join(map(str, threads))}."
+        f"{options.rate_hz:g} Hz{few}, on one thread, as the program runs."
     )
     lines: list[dict[str, Any]] = []
     try:
         errors = _errors(everyone, frozen, lines, page)
-        _run_times(everyone, threads, options, frozen, lines, page)
-        _front(errors, lines, threads[0], page)
+        _run_times(everyone, options, frozen, lines, page)
+        _front(errors, lines, page)
     except KeyboardInterrupt:
         kept = f": what was measured is in {options.out}" if options.out else ""
         page.warn(f"bench stopped before its end{kept}")
@@ -131,7 +113,7 @@ def _errors(
     columns = ("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %")
     page.section("Error", text, (*columns, "force error %"))
     rows: list[ErrorRow] = []
-    for subject in page.tracked(everyone, "error"):
+    for subject in everyone:
         try:
             for row in error_rows(subject, frozen):
                 rows.append(row)
@@ -155,13 +137,12 @@ def _error_cells(error: dict[str, float]) -> tuple[str, ...]:
 
 def _run_times(
     everyone: Sequence[Subject],
-    threads: Sequence[int],
     options: argparse.Namespace,
     frozen: FrozenSet,
     lines: list[dict[str, Any]],
     page: BenchPage,
 ) -> None:
-    columns = ("method", "threads", *(f"back to back {figure}" for figure in _FIGURES.values()))
+    columns = ("method", *(f"back to back {figure}" for figure in _FIGURES.values()))
     columns += (*(f"{options.rate_hz:g} Hz {figure}" for figure in _FIGURES.values()), "missed", "CPU %")
     text = (
         "Each row in a process of its own, with all taps that the method takes; only a model that takes poses is "
@@ -170,27 +151,27 @@ def _run_times(
     )
     page.section("Run time", text, (*columns, "start-up ms", "MB"))
     window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
-    for subject, count in page.tracked([(subject, count) for count in threads for subject in everyone], "run times"):
-        job = {"subject": subject._asdict(), "threads": count}
+    for subject in everyone:
+        job = {"subject": subject._asdict(), "threads": 1}
         starts = 5 if options.ticks >= 300 else 1
-        start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, count, starts)
-        answer = measured(job | {"do": "time", "rate_hz": options.rate_hz, "ticks": options.ticks}, count)
+        start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, starts)
+        answer = measured(job | {"do": "time", "rate_hz": options.rate_hz, "ticks": options.ticks})
         paced, both = answer["paced"], {"back_to_back": answer["back_to_back"], "paced": answer["paced"]["times"]}
         cells = [cell for times in both.values() for cell in _percentiles(times)]
         cells += [f"{paced['missed']} of {paced['ticks']}", f"{paced['cpu_percent']:.1f}", f"{start_up_ms:.0f}"]
-        page.row((subject.name, str(count), *cells, "-" if resident_mb is None else f"{resident_mb:.0f}"))
+        page.row((subject.name, *cells, "-" if resident_mb is None else f"{resident_mb:.0f}"))
         figures = {f"{how}_{figure}": times[figure] for how, times in both.items() for figure in _FIGURES}
         figures |= {"missed": paced["missed"], "cpu_percent": paced["cpu_percent"]}
-        about = {"method": subject.name, "threads": count, "start_up_ms": start_up_ms, "resident_mb": resident_mb}
+        about = {"method": subject.name, "start_up_ms": start_up_ms, "resident_mb": resident_mb}
         lines.append(about | figures)
 
 
-def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
+def measured(job: dict[str, Any]) -> dict[str, Any]:
     """Return a child's result of a job of `edge.bench.timing`; raises BenchError, with its last line, if it failed."""
     # The child imports the same modules as this process, however they were located.
     script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.timing import main; sys.exit(main())"
     libraries = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM")
-    variables = {f"{library}_THREADS": str(threads) for library in libraries}
+    variables = {f"{library}_THREADS": "1" for library in libraries}
     command, pipe = [sys.executable, "-c", script], subprocess.PIPE
     environment = os.environ | variables
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as child:
@@ -204,7 +185,7 @@ def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
     return json.loads(output)
 
 
-def start_up(job: dict[str, Any], threads: int = 1, starts: int = 5) -> tuple[float, float | None]:
+def start_up(job: dict[str, Any], starts: int = 5) -> tuple[float, float | None]:
     """Return the time from the spawn of a process to its first pattern in [ms], imports and all, and its memory.
 
     Both are medians of so many starts; the memory is the most resident until then, in [MB], None where it is not shown.
@@ -213,7 +194,7 @@ def start_up(job: dict[str, Any], threads: int = 1, starts: int = 5) -> tuple[fl
     resident_mb: list[float] = []
     for _ in range(starts):
         spawned_ns = time.monotonic_ns()  # one clock for all processes of a machine
-        answer = measured(job, threads)
+        answer = measured(job)
         took_ms.append((answer["first_ns"] - spawned_ns) / 1e6)
         if answer["resident_mb"] is not None:
             resident_mb.append(answer["resident_mb"])
@@ -225,14 +206,14 @@ def _percentiles(times: dict[str, Any]) -> tuple[str, str, str, str]:
     return f"{times['p50_us']:.0f}", f"{times['p99_us']:.0f}", p999, f"{times['max_us']:.0f}"
 
 
-def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], threads: int, page: BenchPage) -> None:
-    paced_us = {row["method"]: row["paced_p50_us"] for row in lines if row.get("threads") == threads}
+def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], page: BenchPage) -> None:
+    paced_us = {row["method"]: row["paced_p50_us"] for row in lines if "paced_p50_us" in row}
     rows = sorted((row for row in errors if row.name in paced_us), key=lambda row: paced_us[row.name])
     if not rows:
         return
     text = "* is on the Pareto front: no other is at least as good in both RMSE and paced p50."
     columns = ("front", "method", "taps given", "RMSE %", "PSNR dB", "paced p50 us")
-    page.section("Pareto front", f"On {threads} thread{'s' * (threads > 1)}. {text}", columns)
+    page.section("Pareto front", text, columns)
     best = front([(row.error["rmse_percent"], paced_us[row.name]) for row in rows])
     for row, is_best in zip(rows, best, strict=True):
         figures = (f"{row.error['rmse_percent']:.2f}", f"{row.error['psnr_db']:.2f}", f"{paced_us[row.name]:.0f}")

@@ -1,6 +1,5 @@
-"""The demo around one run: its robot, its scenes, its score against the truth, and its map."""
+"""The demo around one run: its scenes, its score against the truth, and its map."""
 
-import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,13 +18,7 @@ from edge.mapping.sink import MapSink, MapState
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.commands import RESET, Commands
-from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.terminal.argument_types import columns
-from edge.terminal.heatmap import Panel, draw, shows_colours
-from edge.terminal.progress_bar import drawn
-from firmware_bridge.poses import PadPose
-from firmware_bridge.zeroing.baseline import deformation
 
 if TYPE_CHECKING:
     from edge.view.server import LiveView
@@ -47,16 +40,9 @@ class DemoRecording:
         counts = self.arrays["counts"]
         self.figure_taps = len(self.arrays["tap_pose"])
         self.scenes = dict(zip(map(_key, counts), self.arrays["scene"].tolist(), strict=True))
-        # Tap and indentation in [mm] of each scan of one; after those of the figure come those played in their place.
         played = zip(counts, self.arrays["tap"].tolist(), self.arrays["indentation_mm"].tolist(), strict=True)
+        # Tap and indentation in [mm] of each scan of one.
         self.taps = {_key(scan): (tap, depth_mm) for scan, tap, depth_mm in played if tap >= 0}
-        options = zip(self.arrays["option_counts"], self.arrays["option_indentation_mm"].tolist(), strict=True)
-        for tap, (scans, depths_mm) in enumerate(options, self.figure_taps):
-            self.taps |= {_key(scan): (tap, depth_mm) for scan, depth_mm in zip(scans, depths_mm, strict=True)}
-
-    def place_of(self, tap: int) -> tuple[str, int]:
-        """Return how the names of a tap's arrays begin, and its row in them."""
-        return ("", tap) if tap < self.figure_taps else ("option_", tap - self.figure_taps)
 
 
 def _key(counts: NDArray[np.integer]) -> bytes:
@@ -64,43 +50,23 @@ def _key(counts: NDArray[np.integer]) -> bytes:
 
 
 class DemoScenes:
-    """Announcement of each scene of the demo, and of its outcome unless it is cut off, as events of kind "note"."""
+    """Announcement of each scene of the demo, as events of kind "note"."""
 
     def __init__(self, recording: DemoRecording, tell: Callable[[Event], object], reset: Callable[[], object]) -> None:
-        """Begin before the first scene; `reset` is called where the robot goes on to another object."""
+        """Begin before the first scene; `reset` is called where the robot goes to another object and back."""
         self._recording, self._tell, self._reset = recording, tell, reset
         self._scene = FREE
-        self._patterns = self._checked = self._untrusted = self._dropped = 0
 
     def add(self, result: Result) -> None:
         """Follow the scenes."""
         scene = self._recording.scenes.get(_key(result.scan.counts), self._scene)
-        if scene != self._scene:
-            self._end()
-            self._scene = scene
-            if scene in _BEGINS:
-                self._say(_BEGINS[scene])
-            if scene == SLIDE:
-                self._reset()
-        self._dropped += sum(event.kind == "tap_dropped" for event in result.events)
-        if result.pattern is not None:
-            self._patterns += 1
-            self._checked += result.trusted is not None
-            self._untrusted += result.trusted is False
-
-    def _end(self) -> None:
-        """Announce the outcome of the scene, and count from 0."""
-        if self._scene == FOREIGN:
-            none = "no tap was dropped: this model takes one tap, or has not noticed the other surface"
-            self._say(f"times that earlier taps were dropped: {self._dropped}" if self._dropped else none)
-        elif self._scene == MAGNET:
-            doubted = f"{self._untrusted} of {self._patterns} patterns with the magnet were not to be believed"
-            none = f"none of {self._patterns} patterns with the magnet was checked"
-            self._say(doubted if self._checked else none)
-        self._patterns = self._checked = self._untrusted = self._dropped = 0
-
-    def _say(self, text: str) -> None:
-        self._tell(Event(time.monotonic_ns(), "note", None, f"demo: {text}"))
+        if scene == self._scene:
+            return
+        if SLIDE in (scene, self._scene):
+            self._reset()
+        self._scene = scene
+        if scene in _BEGINS:
+            self._tell(Event(time.monotonic_ns(), "note", None, f"demo: {_BEGINS[scene]}"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,32 +92,22 @@ class DemoScore:
     def __init__(self, recording: DemoRecording, model: Model) -> None:
         """Begin before the first tap."""
         self._recording, self._model = recording, model
-        self._peaks: list[tuple[Result, int, float]] = []  # with number of the recording's tap, and indentation in [mm]
-        self._between = True
+        self._peaks: dict[int, tuple[Result, float]] = {}  # with the indentation in [mm], by number of the tap
         self.complete = False
 
     def add(self, result: Result) -> None:
         """Keep the result if it is the strongest of its tap."""
-        if self.complete:
-            return
         key = _key(result.scan.counts)
-        self._between |= result.contact is False
-        figure_over = self._between and len(self._peaks) == self._recording.figure_taps
-        if figure_over or (self._peaks and self._recording.scenes.get(key, FREE) != FREE):
-            self.complete = True
-            return
-        if key not in self._recording.taps or result.pattern is None or result.force_counts is None:
+        self.complete |= bool(self._peaks) and self._recording.scenes.get(key, FREE) != FREE
+        if self.complete or key not in self._recording.taps or result.pattern is None:
             return
         tap, indentation_mm = self._recording.taps[key]
-        if self._between or tap != self._peaks[-1][1]:
-            self._peaks.append((result, tap, indentation_mm))
-            self._between = False
-        elif result.force_counts > (self._peaks[-1][0].force_counts or 0):
-            self._peaks[-1] = result, tap, indentation_mm
+        if tap not in self._peaks or (result.force_counts or 0) > (self._peaks[tap][0].force_counts or 0):
+            self._peaks[tap] = result, indentation_mm
 
     def scores(self) -> list[TapScore]:
         """Return the scores of the taps that got a pattern."""
-        return [self._score(number, *peak) for number, peak in enumerate(self._peaks)]
+        return [self._score(tap, *peak) for tap, peak in self._peaks.items()]
 
     def truth(self, result: Result) -> NDArray[np.float32] | None:
         """Return the true pattern (H, W) in [mm] of a scan of the figure; None of any other."""
@@ -159,19 +115,17 @@ class DemoScore:
         return None if press is None else self._true_pattern(*press)
 
     def _true_pattern(self, tap: int, indentation_mm: float) -> NDArray[np.float32]:
-        whose, row = self._recording.place_of(tap)
-        return self._recording.arrays[f"{whose}unit_patterns"][row].astype(np.float32) * np.float32(indentation_mm)
+        return self._recording.arrays["unit_patterns"][tap].astype(np.float32) * np.float32(indentation_mm)
 
-    def _score(self, number: int, result: Result, tap: int, indentation_mm: float) -> TapScore:
+    def _score(self, tap: int, result: Result, indentation_mm: float) -> TapScore:
         if result.pattern is None:
             raise ValueError("peak has no pattern, expected one kept by add")
         full_scale, truth = self._model.contract.output_full_scale, self._true_pattern(tap, indentation_mm)
-        whose, row = self._recording.place_of(tap)
-        x_mm, y_mm, turn_deg = self._recording.arrays[f"{whose or 'tap_'}pose"][row, :3].tolist()
+        x_mm, y_mm, turn_deg = self._recording.arrays["tap_pose"][tap, :3].tolist()
         alone = result.pattern if result.taps_used < 2 else self._alone(result)
         error_db = float(psnr_db(result.pattern, truth, full_scale))
         errors = (float(rmse_percent(pattern, truth, full_scale)) for pattern in (result.pattern, alone))
-        return TapScore(number, (x_mm, y_mm, turn_deg), result, truth, error_db, *errors)
+        return TapScore(tap, (x_mm, y_mm, turn_deg), result, truth, error_db, *errors)
 
     def _alone(self, result: Result) -> NDArray[np.float32]:
         """Return the pattern of a result's newest tap alone."""
@@ -182,13 +136,12 @@ class DemoScore:
         window[0] = contract.scale_window(result.window)[0]
         return self._model.run(window)
 
-    def text(self, coloured: bool) -> str:
-        """Return the table of the scores, and the last tap's maps."""
+    def text(self) -> str:
+        """Return the table of the scores."""
         scores, of = self.scores(), f"of {self._recording.figure_taps} taps scored"
         if not scores:
             return f"none {of}: the run ended before a tap had a pattern"
-        table = f"{len(scores)} {of} at their peak, against the simulated truth:\n{score_table(scores)}"
-        return f"{table}\n\ntap {scores[-1].tap + 1}:\n{_score_picture(scores[-1], coloured)}"
+        return f"{len(scores)} {of} at their peak, against the simulated truth:\n{score_table(scores)}"
 
 
 def score_table(scores: Sequence[TapScore]) -> str:
@@ -217,23 +170,6 @@ def _gained(scores: Sequence[TapScore]) -> str:
     return f"With all {last.result.taps_used} taps the pattern is {last.rmse_percent:.2f} % of full scale off; {alone}."
 
 
-def _score_picture(score: TapScore, coloured: bool) -> str:
-    """Return the taxels, the pattern and the truth as maps side by side."""
-    result = score.result
-    if result.pattern is None or result.baseline is None:
-        raise ValueError("score has no pattern, expected one made by DemoScore")
-    taxels_z = deformation(result.scan.counts, result.baseline)[2]
-    highest = float(max(result.pattern.max(), score.truth.max()))
-    believed = {True: "super-resolved", None: "not checked", False: "NOT BELIEVED"}[result.trusted]
-    height, width = result.pattern.shape
-    panels = [
-        Panel(f"taxels, {taxels_z.shape[0]} x {taxels_z.shape[1]}", taxels_z, 0.0, float(taxels_z.max()), "counts"),
-        Panel(f"{believed}, {height} x {width}", result.pattern, 0.0, highest, result.pattern_unit),
-        Panel("truth", score.truth, 0.0, highest, result.pattern_unit),
-    ]
-    return draw(panels, columns(), coloured)
-
-
 class DemoMap(MapSink):
     """Map of the slide alone, beside the truth, a letter: `complete` is true once the slide is over."""
 
@@ -254,26 +190,18 @@ class DemoMap(MapSink):
         elif scene is not None:
             self.complete = self._begun
 
-    def text(self, coloured: bool) -> str:
-        """Return the map's distance from the truth, and both as pictures; nothing before the slide."""
+    def text(self) -> str:
+        """Return the map's distance from the truth; nothing before the slide."""
         if not self._begun:
             return ""
         if not self.whole.fused:
             return f"the letter is not on the map: {self.summary()}"
-        contact = np.nan_to_num(self.whole.contact()[0])
-        px_per_mm = self.whole.grid.px_per_mm
+        contact, px_per_mm = np.nan_to_num(self.whole.contact()[0]), self.whole.grid.px_per_mm
         away_mm = float(boundary_distance_mm(contact[None], self._letter[None], 0.5, 1 / px_per_mm)[0])
-        rows, cols = (np.flatnonzero(self._letter.any(axis=axis)) for axis in (1, 0))
-        margin = round(1.0 * px_per_mm)  # of 1 mm
-        shown = tuple(slice(max(0, lines[0] - margin), lines[-1] + 1 + margin) for lines in (rows, cols))
-        length_mm = (cols[-1] + 1 - cols[0]) / px_per_mm
-        title = f"map of a letter of {length_mm:.0f} mm, from one slide: {self.whole.fused} patterns fused, "
-        panels = [
-            Panel("map", contact[shown], 0.0, 1.0, "touched"),
-            Panel("truth", self._letter[shown].astype(np.float64), 0.0, 1.0, "touched"),
-        ]
-        pictures = "\n\n".join(draw([panel], columns(), coloured, widest=72) for panel in panels)
-        return f"{title}outline {away_mm:.2f} mm from the truth\n{pictures}"
+        columns = np.flatnonzero(self._letter.any(axis=0))
+        length_mm = (columns[-1] + 1 - columns[0]) / px_per_mm
+        fused = f"{self.whole.fused} patterns fused, outline {away_mm:.2f} mm from the truth"
+        return f"map of a letter of {length_mm:.0f} mm, from one slide: {fused}"
 
 
 class Demo(Sink):
@@ -288,7 +216,6 @@ class Demo(Sink):
     def __init__(
         self,
         model: Model,
-        source: Source,
         stream: TextIO,
         view: "LiveView | None",
         watching: Sequence[Sink],
@@ -305,24 +232,18 @@ class Demo(Sink):
             view.show_truth(self._score.truth)
         self.map = DemoMap(recording, None if view is None else view.show_map) if maps else None
         self._unprinted = [self._score, *([] if self.map is None else [self.map])]
-        # Without poses a model's taps must follow the paper's schedule, as the recording does.
-        self._touch = source.steer() if model.contract.takes_poses else None
-        self._tapping = False
 
         def tell(event: Event) -> None:
             for sink in watching:
                 sink.tell(event, {})
 
         self._scenes = DemoScenes(recording, tell, lambda: commands.put(RESET))
-        how = "where it is proposed" if self._touch else "by a fixed schedule"
         taps = f"{str(recording.arrays['surface'])!r} {recording.figure_taps} times"
-        sys.stderr.write(f"demo: an emulated sensor taps {taps}, {how}, zeroed first\n")
+        sys.stderr.write(f"demo: an emulated sensor taps {taps}, turned by 5 degrees each time, zeroed first\n")
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Follow the demo."""
         self._score.add(result)
-        if self._touch is not None:
-            self._steer(result, self._touch)
         self._scenes.add(result)
         complete = [part for part in self._unprinted if part.complete] if self._loops else []
         for part in complete:
@@ -331,21 +252,12 @@ class Demo(Sink):
             page = "" if self._view is None else f"live page: {self._view.url}; "
             sys.stderr.write(f"\n{page}the demo continues until Ctrl-C\n")
 
-    def _steer(self, result: Result, touch: Callable[[PadPose | None], object]) -> None:
-        """Send the robot, after each tap of the figure, where the next one is proposed."""
-        if result.contact:
-            self._tapping |= _key(result.scan.counts) in self._recording.taps
-        elif self._tapping and result.contact is False:
-            self._tapping = False
-            touch(None if result.next_tap is None else result.next_tap.target)
-
     def finish(self) -> None:
         """Print what was not printed while the demo went on."""
         for part in [*self._unprinted]:
             self._print(part)
 
     def _print(self, part: DemoScore | DemoMap) -> None:
-        stream = drawn(self._stream)
-        if text := part.text(shows_colours(os.environ, terminal=stream.isatty(), encoding=stream.encoding)):
-            stream.write(f"\n{text}\n")
+        if text := part.text():
+            self._stream.write(f"\n{text}\n")
         self._unprinted.remove(part)

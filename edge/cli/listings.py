@@ -1,7 +1,6 @@
 """`edge-sr models` and `edge-sr devices`: what is bundled, and what is plugged in."""
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from typing import Final, TextIO
@@ -16,8 +15,7 @@ from firmware_bridge.links.discovery import Found, devices
 from firmware_bridge.schedule import Ticker
 
 RATE_HZ: Final = 100.0
-ROUNDS: Final = 3  # in which the models take turns, so that a bad second of a shared host falls on no model alone
-TICKS: Final = 50
+TICKS: Final = 150
 NOTHING = (
     "no adapter found: check both plugs of a VScom (the second is the sensor's power), the lines of `dmesg` since "
     "it was plugged in, and that this user is in the group dialout"
@@ -50,14 +48,8 @@ def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         default = {DEFAULT_MODEL: " default", POSED_MODEL: " with poses"}.get(path.stem, "")
         out.write(f"{cells}{figures}{times}{default}\n")
     out.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
-    if not took_us:
-        return
-    out.write(f"run times of {ROUNDS * TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
-    # The ratio is 1.2 to 1.4 on a quiet machine.
-    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > 3 * p50]
-    if uneven:
-        named = ", ".join(uneven)
-        out.write(f"those of {named} are uneven, as on a busy machine: measure again when it is quiet\n")
+    if took_us:
+        out.write(f"run times of {TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
 
 
 def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
@@ -65,31 +57,29 @@ def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
 
     Windows are random, with all taps: run time does not depend on their values.
     """
-    rng, took_us = np.random.default_rng(1), np.zeros((len(models), ROUNDS, TICKS))
-    for turn, model in enumerate(tracked([*models] * ROUNDS, "run times", "model")):
+    rng, made = np.random.default_rng(1), list[tuple[float, float]]()
+    for model in tracked(models, "run times", "model"):
         contract = model.contract
         shape = (16, contract.taps, 3, contract.rows, contract.cols)
         windows = (rng.standard_normal(shape) * 1000).astype(np.float32)
-        ticker = Ticker(RATE_HZ)
+        ticker, took_us = Ticker(RATE_HZ), list[float]()
         for tick in range(TICKS):
             ticker.wait()
             start_ns = time.perf_counter_ns()
             model.run(contract.scale_window(windows[tick % len(windows)]))
-            took_us[turn % len(models), turn // len(models), tick] = (time.perf_counter_ns() - start_ns) / 1e3
-    both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")
-    return [(float(p50), float(p99)) for p50, p99 in both.T]
+            took_us.append((time.perf_counter_ns() - start_ns) / 1e3)
+        p50, p99 = np.percentile(took_us, [50, 99], method="inverted_cdf")
+        made.append((float(p50), float(p99)))
+    return made
 
 
 def show_devices(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
-    """Print the devices, opening none, what to type to read each, and what prevents its use; with --json for programs.
+    """Print the devices, opening none, what to type to read each, and what prevents its use.
 
     Raises DeviceError if no adapter is among them.
     """
     listed, notes = devices()
-    if options.json:
-        out.write(json.dumps({"devices": [device._asdict() for device in listed], "notes": notes}, indent=1) + "\n")
-    else:
-        out.write("".join(f"{line}\n" for line in page(listed, notes, columns())))
+    out.write("".join(f"{line}\n" for line in page(listed, notes, columns())))
     if not any(device.adapter for device in listed):
         raise DeviceError(NOTHING)
 

@@ -20,14 +20,14 @@ from edge.api import (
     SinkError,
     UsageError,
 )
-from edge.cli.option_table import COMMAND_LIST, COMMANDS, EXAMPLES, TABLE, Option, runtime_options
+from edge.cli.option_table import COMMAND_LIST, COMMANDS, EXAMPLES, TABLE, runtime_options
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import EXIT_USAGE, Parser
 from firmware_bridge.errors import harmless
 
 STDIN, STDOUT, STDERR = 0, 1, 2
 _FIXED: Final[dict[str, dict[str, Any]]] = {
-    "demo": {"sensor": None, "id_map": None, "force": False, "baseline": None, "poses": [], "give_up_s": None},
+    "demo": {"sensor": None, "id_map": None, "baseline": None, "poses": [], "give_up_s": None},
     "replay": {"source": [], "id_map": None, "give_up_s": None, "poses": []},
 }
 """Options of a run that a command of its kind does not have, with the values that they have there."""
@@ -97,14 +97,12 @@ def parser(command: str = "", *, usual: bool = False) -> argparse.ArgumentParser
     if not command:
         made.add_argument("-h", "--help", action="help", help="show all options; -h shows the usual ones")
     for listed in help_.groups:
-        shown = [row for row in listed.options if not usual or (isinstance(row, Option) and row.name in _USUAL)]
+        shown = [option for option in listed.options if not usual or option.name in _USUAL]
         if not shown:
             continue
         group = made if listed.title is None else made.add_argument_group(listed.title, listed.about)
-        for row in shown:
-            to = group.add_mutually_exclusive_group() if isinstance(row, tuple) else group
-            for option in row if isinstance(row, tuple) else (row,):
-                to.add_argument(option.name, **option.settings)
+        for option in shown:
+            group.add_argument(option.name, **option.settings)
     made.set_defaults(**_FIXED.get(command, {}))
     return made
 

@@ -34,11 +34,11 @@ def _runtime(name: str, kind: Callable[[str], Any], **more: Any) -> Option:
 
 
 class Group:
-    """Options under a title of the help, or under that of --help; of those in a tuple only one may be given."""
+    """Options under a title of the help, or under that of --help."""
 
-    def __init__(self, title: str | None, *options: Option | tuple[Option, ...], about: str | None = None) -> None:
+    def __init__(self, title: str | None, *options: Option, about: str | None = None) -> None:
         self.title, self.options, self.about = title, options, about
-        named = (option for option in options if isinstance(option, Option) and not option.name.startswith("-"))
+        named = (option for option in options if not option.name.startswith("-"))
         self.arguments = [argument.settings["metavar"] + "..." * ("nargs" in argument.settings) for argument in named]
 
 
@@ -51,7 +51,6 @@ SENSOR: Final = (
     Option("--id-map MAP", str, "kind of pad: which CAN message is which taxel: %(choices)s; A and B are boards before "
            f"2021 (default {USPA44_MAP.name})", choices=ID_MAPS),
     Option("--rate-hz R", positive, "scans a second at which a recording is played; for a device, its expected rate"),
-    Option("--force", bool, "use a sensor file of an emulated sensor on a real one all the same"),
 )
 RESULTS: Final = (
     Group("model",
@@ -134,6 +133,8 @@ examples:
   edge-sr --sink jsonl:- | your-program
 """
 
+_AS_EDGE_SR: Final = "All other options are those of edge-sr: its --help lists sources, outputs and keys.\n"
+
 TABLE: Final = {
     "": Subcommand(
         "edge.cli.run_command:follow",
@@ -166,19 +167,12 @@ Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
         "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
         "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
         (Group("sensor", Option("--rate-hz R", positive, "scans a second (default 100)")), *RESULTS),
-        "examples:\n  edge-sr demo\n  edge-sr demo --view\n",
     ),
     "record": Subcommand(
         "edge.cli.run_command:record",
         "Runs like edge-sr, and records scans, patterns and events.",
         (Group("file", Option("file FILE", str, "new file, .mcap")), *RUN),
-        """\
-examples:
-  edge-sr record press.mcap
-  edge-sr replay press.mcap --view
-
-All other options are those of edge-sr: its --help lists sources, outputs and keys.
-""",
+        _AS_EDGE_SR,
     ),
     "replay": Subcommand(
         "edge.cli.run_command:replay",
@@ -193,18 +187,7 @@ All other options are those of edge-sr: its --help lists sources, outputs and ke
                     nargs="*",
                 ),
                 Option("--example", bool, "play what is bundled: two emulated fingers grip a pen and a nut"),
-                (
-                    Option(
-                        "--baseline FILE",
-                        Path,
-                        "readings of the free pad, from edge-sr baseline, instead of recorded ones",
-                    ),
-                    Option(
-                        "--zero",
-                        bool,
-                        "take the first 100 scans during which the pad is free and still as its baseline",
-                    ),
-                ),
+                Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline (default: recorded)"),
                 Option("--paced", bool, "play at the original speed, with current times; so does --view with a --sink"),
                 Option("--sensor FILE", Path, "sensor file of edge-sr doctor, instead of the recorded order and axes"),
                 Option("--rate-hz R", positive, "scans a second, if the file does not state it or with --paced"),
@@ -217,14 +200,6 @@ with the baseline (the readings of the free pad) that was in use at the first sc
 recording does not begin free and still, those scans are the baseline during which the pad is still and pressed least.
 
 With --view and no --sink it is played at its own speed, from when the page is opened.
-
-examples:
-  edge-sr replay --example --view
-  edge-sr replay left.csv right.csv \\
-          --view
-  edge-sr replay press.mcap \\
-          --model mtsr4-int8 \\
-          --sink mcap:again.mcap
 """,
     ),
     "convert": Subcommand(
@@ -240,10 +215,6 @@ examples:
         """\
 Formats: .npz holds arrays for numpy, .csv counts, times and poses of one sensor (of several a file each). What the \
 new file cannot hold is printed. Nothing is computed, and no file is replaced.
-
-examples:
-  edge-sr convert press.mcap press.npz
-  edge-sr convert press.mcap press.csv
 """,
     ),
     "map": Subcommand(
@@ -266,20 +237,13 @@ examples:
             ),
             *RUN,
         ),
-        """\
+        f"""\
 Needs poses of the pad (where it is, and how it is turned) in the object's plane: lines on stdin, or those of a \
-recording. x points right and y down, as in a pattern.
+recording. x points right and y down, as in a pattern. A line of poses:
+  {{"cmd": "pose", "x_mm": 1.5,
+   "y_mm": -20, "turn_deg": 5}}
 
-example:
-  my_robot_poses | edge-sr map \\
-          --out part.npz --png part.png
-
-A line of poses:
-  {"cmd": "pose", "x_mm": 1.5,
-   "y_mm": -20, "turn_deg": 5}
-
-All other options are those of edge-sr: its --help lists sources, outputs and keys.
-""",
+{_AS_EDGE_SR}""",
     ),
     "models": Subcommand(
         "edge.cli.listings:show_models",
@@ -293,23 +257,14 @@ All other options are those of edge-sr: its --help lists sources, outputs and ke
             Group("sensor", *SENSOR),
             Group("baseline", Option("--out FILE", Path, "file for the baseline", required=True)),
         ),
-        """\
-Keep the pad still, with nothing touching it.
-
-examples:
-  edge-sr baseline --out zero.json
-  edge-sr --baseline zero.json
-
-Of a recording it takes the scans during which the pad is still and pressed least:
-  edge-sr baseline --out zero.json \\
-          --source replay:f.csv
-""",
+        "Keep the pad still, with nothing touching it. Of a recording it takes the scans in which the pad is still and "
+        "pressed least.",
     ),
     "devices": Subcommand(
         "edge.cli.listings:show_devices",
         "Lists serial ports, CAN adapters and CAN interfaces, what to type after --source for each, and what prevents "
         "its use.",
-        (Group(None, Option("--json", bool, "write JSON, for programs")),),
+        (),
         "Exit code: 3 if there is no adapter.",
     ),
     "doctor": Subcommand(
@@ -359,7 +314,6 @@ Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong 
                 Option("--out DIR", Path, "folder for bench.csv and bench.md"),
                 Option("--rate-hz R", positive, "paced ticks a second (default 100)", default=100.0),
                 Option("--ticks N", whole(10), "paced ticks a row (default 3000)", default=3000),
-                Option("--threads N", whole(1), "numbers of threads (default 1 2)", nargs="+", default=[1, 2]),
                 Option("--models DIR", Path, "folder of your own models, measured as well"),
                 Option("--only NAME", str, "measure only these methods", nargs="+"),
             ),
@@ -367,9 +321,6 @@ Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong 
         """\
 Run time is measured back to back, and paced: one inference a tick, as on a robot. A row takes half a minute. No other \
 program should run meanwhile.
-
-example:
-  edge-sr bench --out today --threads 1
 
 Ctrl-C ends it with exit code 130, after the rows measured so far are written.
 """,

@@ -91,7 +91,7 @@ def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     source = open_recording(
         *files,
         sensor=options.sensor,
-        zero=options.zero or options.baseline is not None,
+        zero=options.baseline is not None,
         paced=paced,
         rate_hz=options.rate_hz,
         bar=not paced and "status" not in options.sink,
@@ -114,7 +114,7 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 
         kind, sensor_file = "replay", sensor_settings(options.sensor, options.id_map)
         played = options.source[0].removeprefix("replay:")
-        baselines, notes = recorded_baselines(played, sensor_file, options.rate_hz, force=options.force)
+        baselines, notes = recorded_baselines(played, sensor_file, options.rate_hz)
         print("\n".join(notes), file=err)
     else:
         with stop_on_signals() as stop, _source(options, give_up_s=0) as source:
@@ -129,7 +129,7 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 
 
 def _source(options: argparse.Namespace, give_up_s: float) -> Source:
-    names = ("sensor", "id_map", "rate_hz", "force")
+    names = ("sensor", "id_map", "rate_hz")
     return open_source(*options.source, give_up_s=give_up_s, **{name: getattr(options, name) for name in names})
 
 
@@ -227,11 +227,8 @@ def run(
 
                 scores = sys.stderr if "jsonl:-" in options.sink else sys.stdout
                 watching = [messages, *(() if view is None else view.sinks)]
-                played = demo.Demo(model, source, scores, view, watching, commands, loops=loops, maps=mapping is None)
+                played = demo.Demo(model, scores, view, watching, commands, loops=loops, maps=mapping is None)
                 asked = replace(asked, every_scan=True)  # it shows the run time of every scan
-            if loops:
-                # After 100 scans without contact it is at its first tap: 180 lie before it, 34 between taps.
-                asked = replace(asked, idle_reset_s=min(100 / (options.rate_hz or 100.0), asked.idle_reset_s))
             settings = {"baselines": baselines, "counts_per_newton": options.counts_per_newton}
             runtime = open_runtime(model, source, **settings, **asdict(asked))
             give_back_memory()

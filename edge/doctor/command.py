@@ -21,7 +21,6 @@ from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.grip import ASK as GRIP
 from edge.doctor.grip import Grip
 from edge.doctor.guided_press import (
-    ASK_WEIGHT,
     PARTLY_ERROR,
     PATIENCE_S,
     GuidedPress,
@@ -34,7 +33,6 @@ from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, stored_baselines
 from edge.terminal.argument_types import columns, wrapped
-from edge.terminal.progress_bar import drawn, progress, rewritable
 from edge.terminal.stop_signals import stop_on_signals
 from firmware_bridge import in_place
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError, as_typed, harmless
@@ -84,20 +82,12 @@ class Visit:
         self._options, self._reader, self._sensor_file = options, reader, sensor_file
         self._link = reader.link
         self._err, self._stop, self._rehearsal = err, stop, rehearsal
-        self._rewritable = rewritable(err)
 
     def watch(self, watched: Watched) -> None:
         """Watch the link while the pads are free; raises LinkLostError."""
         length_s = self._options.drift_s if self._rehearsal is None else WATCHED_S
         self._say(f"{self._link.name}: watching for {length_s:g} s; keep the pad free and still")
-        with progress("watching", length_s, "s", stream=self._err) as bar:
-
-            def show(scans: int, passed_s: float) -> None:
-                if passed_s > 0:
-                    bar.set_postfix_str(f"{scans / passed_s:.0f} scans/s", refresh=False)
-                bar.update(min(passed_s, length_s) - bar.n)
-
-            watch(self._reader, watched, length_s, self._stop, tell=show)
+        watch(self._reader, watched, length_s, self._stop)
 
     def press(self, names: Sequence[str], examined: Examined) -> None:
         """Ask for presses on every pad that may be zeroed, and add what is found; raises LinkLostError."""
@@ -114,7 +104,8 @@ class Visit:
     def _press_one(self, name: str, whose: str, examined: Examined) -> None:
         geometry, answers = self._sensor_file.geometry, self._rehearsal is not None or _stdin_is_terminal()
         guide = GuidedPress(geometry, weigh=answers, z_noise_counts=examined.z_noise_counts[name])
-        self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
+        skips = " Enter skips a request." * (self._rehearsal is None and _stdin_is_terminal())
+        self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.{skips}")
         self._lead(guide, name, examined, whose)
         findings, mounting = judge_press(guide.presses, geometry, kept=self._options.out is not None)
         if guide.weight_g is not None:
@@ -153,10 +144,10 @@ class Visit:
 
     def _lead(self, guide: GuidedPress, name: str, examined: Examined, whose: str) -> None:
         """Lead a person through a dialogue about one sensor."""
-        baseline, mounting, asked = examined.baselines[name], self._sensor_file.mountings.get(name), guide.first
+        baseline, mounting = examined.baselines[name], self._sensor_file.mountings.get(name)
         if not (self._stop.is_set() or self._link.ended):
             self._ask(whose, guide.first)
-        received_s = asked_s = time.monotonic()
+        received_s = time.monotonic()
         typed_line()  # one of before is no answer to this request
         while not (guide.done or self._stop.is_set() or self._link.ended):
             if time.monotonic() - received_s > GIVEN_UP_S:
@@ -171,28 +162,13 @@ class Visit:
             line = typed_line() if self._rehearsal is None else self._rehearsal.typed_line()
             if line is not None:
                 requests.append(guide.type(line))
-            for asked in filter(None, requests):
-                self._ask(whose, asked)
-                asked_s = time.monotonic()
-            if not asked.endswith(ASK_WEIGHT):  # what is being typed would be drawn over
-                self._show_load(guide.felt, asked_s + PATIENCE_S - time.monotonic())
-        self._rewrite("")
+            for request in filter(None, requests):
+                self._ask(whose, request)
 
     def _ask(self, whose: str, request: str) -> None:
         self._say(whose + request)
         if self._rehearsal is not None:
             self._rehearsal.answer(request)
-
-    def _show_load(self, felt: float, left_s: float) -> None:
-        """Show the load, as a share of that of a press, in a line that is rewritten in place."""
-        skip = ", Enter skips" if _stdin_is_terminal() else ""
-        text = f"felt [{'#' * min(int(10 * felt), 10):10}] {max(left_s, 0):.0f} s left{skip}"
-        self._rewrite(text[: columns() - 1])
-
-    def _rewrite(self, text: str) -> None:
-        if self._rewritable:
-            drawn(self._err).write(f"\r{text}\x1b[K")
-            self._err.flush()
 
     def _why_no_press(self) -> str | None:
         if self._rehearsal is not None:
@@ -206,7 +182,6 @@ class Visit:
         return None
 
     def _say(self, text: str) -> None:
-        self._rewrite("")
         print(*wrapped(text, columns()), sep="\n", file=self._err, flush=True)
 
 
@@ -240,7 +215,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         failed: BridgeError | None = None
         whole = False
         with reader:
-            refuse_emulated(sensor_file, link.kind, link.origin, options.force)
+            refuse_emulated(sensor_file, link.kind, link.origin)
             try:
                 visit.watch(watched)
                 whole = not stop.is_set()

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -17,6 +17,7 @@ from edge.doctor.link_checks import Watched
 from edge.doctor.taxel_checks import Samples
 from edge.errors import UsageError
 from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines
+from edge.terminal.progress_bar import progress
 from edge.validation import check_baselines, check_positive
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.links.base import LinkReader
@@ -162,29 +163,19 @@ def prepare(
     return LinkReader(link), sensor_file, watched
 
 
-def watch(
-    reader: LinkReader,
-    watched: Watched,
-    length_s: float,
-    stop: threading.Event,
-    *,
-    tell: Callable[[int, float], object] = lambda scans, passed_s: None,
-) -> None:
-    """Watch an open link for `length_s` in [s], or until `stop`, or until nothing comes any more; raises LinkLostError.
-
-    `tell` is called after each read with the number of scans and the time that has passed, in [s].
-    """
+def watch(reader: LinkReader, watched: Watched, length_s: float, stop: threading.Event) -> None:
+    """Watch an open link for `length_s` in [s], until `stop`, or until nothing comes any more; raises LinkLostError."""
     start_s = now_s = received_s = time.monotonic()
-    link, scans = reader.link, 0
+    link = reader.link
     try:
-        while now_s - start_s < length_s and not (stop.is_set() or link.ended) and now_s - received_s <= GIVEN_UP_S:
-            for scan in reader.read(POLL_S):
-                watched.scans.setdefault(scan.sensor, []).append(scan)
-                received_s = now_s
-                scans += 1
-            now_s = time.monotonic()
-            watched.duration_s = now_s - start_s
-            tell(scans, watched.duration_s)
+        with progress("watching", length_s, "s") as bar:
+            while now_s - start_s < length_s and not (stop.is_set() or link.ended) and now_s - received_s <= GIVEN_UP_S:
+                for scan in reader.read(POLL_S):
+                    watched.scans.setdefault(scan.sensor, []).append(scan)
+                    received_s = now_s
+                now_s = time.monotonic()
+                watched.duration_s = now_s - start_s
+                bar.update(min(watched.duration_s, length_s) - bar.n)
     finally:
         watched.counters, watched.ids = link.counters(), link.can_ids()
         if (line := link.serial_line()) is not None:
@@ -215,6 +206,6 @@ def examine(
     sensor_file = sensor_settings(sensor, id_map)
     reader, sensor_file, watched = prepare(texts, sensor_file, stored_baselines(baselines, sensor_file), rate_hz)
     with reader:
-        refuse_emulated(sensor_file, reader.link.kind, reader.link.origin, force=False)
+        refuse_emulated(sensor_file, reader.link.kind, reader.link.origin)
         watch(reader, watched, duration_s, threading.Event() if stop is None else stop)
     return judge(watched, time.time()).findings

@@ -255,11 +255,6 @@ class GuidedPress:
         """Take a line: an answer, or Enter alone, which leaves the open request out; returns the next one, or None."""
         return self._go_on(lambda: self._dialogue.throw(_TypedError(line)))
 
-    @property
-    def felt(self) -> float:
-        """Load on the pad by the last reading, of that at which a press is measured."""
-        return _load_counts(self._held) / ON_COUNTS
-
     def _go_on(self, step: Callable[[], str | None]) -> str | None:
         if self.done:
             return None

@@ -15,6 +15,7 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
 
 WATCHED_S: Final = 5.0  # for which the free pad is watched
+ANSWER_S: Final = 1.0  # from a request until a person does what it says
 _WEIGHT_G: Final = 200.0
 
 
@@ -46,7 +47,7 @@ class Rehearsal(Emulator):
             load[2] = _WEIGHT_G / 1000 * 9.80665 * 1176 / USPA44.taxel_count
         elif request.endswith(ASK_WEIGHT):
             self._typed = f"{_WEIGHT_G:g}"
-        self._next_s, self._next = time.monotonic() + 1.0, load  # a person takes a second
+        self._next_s, self._next = time.monotonic() + ANSWER_S, load
 
     def typed_line(self) -> str | None:
         """Return what is typed since the last call, or None."""

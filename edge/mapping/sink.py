@@ -248,7 +248,7 @@ def _emulated_line(width: int) -> NDArray[np.uint8]:
 
 
 def _coloured(shares: NDArray[np.floating], doubted: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    from edge.terminal.heatmap import colours  # not loaded by a run without a picture
+    from edge.mapping.colours import colours  # not loaded by a run without a picture
 
     covered = np.isfinite(shares)
     pixels = colours(np.where(covered, shares, 0)).astype(np.uint8)

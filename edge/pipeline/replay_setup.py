@@ -74,11 +74,11 @@ def open_recording(
 
 
 def recorded_baselines(
-    text: str, sensor_file: SensorFile, rate_hz: float | None, *, force: bool
+    text: str, sensor_file: SensorFile, rate_hz: float | None
 ) -> tuple[dict[str, Baseline], list[str]]:
     """Return the baselines of FILE[,FILE], from where each pad is free and still, and notes where that is.
 
-    `rate_hz` is that of each sensor, where a file does not state it; `force` as in `Source`.
+    `rate_hz` is that of each sensor, where a file does not state it.
 
     Raises:
         BaselineRefusedError: a pad is nowhere free and still.
@@ -87,7 +87,7 @@ def recorded_baselines(
         SourceError: its rate is unknown or out of range.
     """
     replay = ReplayLink(recording_paths(text), rate_hz)
-    refuse_emulated(sensor_file, replay.kind, replay.origin, force)
+    refuse_emulated(sensor_file, replay.kind, replay.origin)
     baselines = free_baselines(replay, with_recorded(sensor_file, [replay]).mountings, opening=True, rate_hz=rate_hz)
     sensors = {track.sensor for recording in replay.recordings for track in recording.tracks}
     notes = [notice.text for notice in replay.notices()]

@@ -14,7 +14,7 @@ from edge.pipeline.cadence import ReadingPace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, LinkReader, Notice, SourceKind
-from firmware_bridge.poses import PadPose, TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.tracks import origin_of
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import POLL_S
@@ -50,13 +50,12 @@ class Source:
         *links: Link,
         sensor_file: SensorFile | None = None,
         rate_hz: float | None = None,
-        force: bool = False,
         give_up_s: float = 0.0,
     ) -> None:
         """Prepare to read one or more links that are not open yet; this source opens and closes them.
 
-        With `force` other scans, too, get properties that the sensor file has from an emulated sensor. A lost link is
-        opened again; `give_up_s` is the longest time that one may be away, in [s], and at 0 its first loss is raised.
+        A lost link is opened again; `give_up_s` is the longest time that one may be away, in [s], and at 0 its first
+        loss is raised.
 
         Raises:
             SourceError: some are emulated and some are not: results of both kinds must not be mixed.
@@ -69,7 +68,6 @@ class Source:
         self.states_poses = any(link.states_poses for link in links)
         self.sensor_file = SensorFile() if sensor_file is None else sensor_file
         self.rate_hz = rate_hz
-        self._force = force
         self.overruns = 0
         self.pace = ReadingPace()
         self._stop = threading.Event()
@@ -113,7 +111,7 @@ class Source:
             for reader in self._readers:
                 opening.enter_context(reader)
             kind = _one_kind([reader.link for reader in self._readers])  # some know their kind only now
-            refuse_emulated(self.sensor_file, kind, self.origin, self._force)
+            refuse_emulated(self.sensor_file, kind, self.origin)
             if not self.patient:
                 opening.callback(self._end_reading)
                 self._threads = [self._started(reader) for reader in self._readers]
@@ -156,10 +154,6 @@ class Source:
         if not self._opened:
             raise self._not_open()
         return self._readers[0].link.kind
-
-    def steer(self) -> Callable[[PadPose | None], None] | None:
-        """Return the function by which the emulated robot of the demo is asked where to tap next; None without."""
-        return next((asked for one in self._readers if (asked := one.link.steer()) is not None), None)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of received, skipped and missed items so far, by name; sums over all links."""

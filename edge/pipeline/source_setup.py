@@ -75,23 +75,21 @@ def with_recorded(sensor_file: SensorFile, links: Iterable[Link]) -> SensorFile:
     return replace(sensor_file, sensors=recorded | dict(sensor_file.sensors))
 
 
-def refuse_emulated(sensor_file: SensorFile, kind: SourceKind, origin: SourceKind | None, force: bool) -> None:
-    """Refuse to use settings of an emulated sensor on a device, or on a recording of anything else, unless forced.
+def refuse_emulated(sensor_file: SensorFile, kind: SourceKind, origin: SourceKind | None) -> None:
+    """Refuse to use settings of an emulated sensor on a device, or on a recording of anything else.
 
     Raises:
         SensorFileError: the sensor file is of an emulated sensor, in part or whole.
     """
-    if "emulated" in (kind, origin) or force:
+    if "emulated" in (kind, origin):
         return
-    this, instead = "is a device", "add --force"
-    if kind == "replay":
-        this, instead = "recording is not known to be of one", "leave --sensor out"
+    this = "recording is not known to be of one" if kind == "replay" else "is a device"
     for name, entry in sensor_file.sensors.items():
         if entry.emulated:
             parts = ", ".join(part for part in PARTS if part in entry.emulated)
             raise SensorFileError(
                 f"the sensor file has {parts} of an emulated sensor {name}, and this {this}: write a new one with "
-                f"edge-sr doctor --out, or {instead}"
+                f"edge-sr doctor --out, or leave --sensor out"
             )
 
 

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, Protocol, Self, TypeVar
 
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
-from firmware_bridge.poses import PadPose, TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import LINK_SILENT_S
@@ -114,10 +114,6 @@ class Link(Protocol):
     def poses(self) -> list[TimedPose]:
         """Return the poses since the last call, all to be used for the scans that the last `read` returned."""
         return []
-
-    def steer(self) -> Callable[[PadPose | None], None] | None:
-        """Return the function that takes where to tap next, None for no proposal; None where there is no robot."""
-        return None
 
     def counters(self) -> dict[str, int]:
         """Return the counts of data received, skipped and missed so far, by name; also after it was closed."""

@@ -193,7 +193,8 @@ def test_readings_over_a_baseline_cut_off_at_0_are_no_counts(tmp_path, cut_off, 
 
 @pytest.fixture
 def recording(tmp_path):
-    return write_recording(tmp_path / "demo.csv", make_counts(30), rate_hz=100)
+    pose = {"pose_time_ns": np.array([50_000_000]), "pose": np.array([[1.0, 2.0, 3.0, 0.2, 1.0]])}
+    return write_npz(tmp_path / "demo.npz", make_counts(30), rate_hz=100.0, **pose)
 
 
 @pytest.mark.parametrize(("loop", "rate_hz", "rounds"), [(False, None, 1), (True, 150, 3)])
@@ -202,6 +203,9 @@ def test_it_plays_through_and_ends_or_begins_again(recording, loop, rate_hz, rou
         scans = read_scans(link, 75)[:75] if loop else read_until_lost(link)
         assert link.ended != loop
         assert loop or link.read(0.1) == []
+        poses = link.poses()[:rounds]
+    assert [one.pose.x_mm for one in poses] == [1.0] * rounds
+    assert all(abs(one.time_ns - scan.time_ns) < 150_000_000 for one, scan in zip(poses, scans[5::30], strict=True))
     assert (stacked(scans) == np.concatenate([make_counts(30)] * rounds)[: len(scans)]).all()
     assert len(scans) == (75 if loop else 30)
 

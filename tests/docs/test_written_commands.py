@@ -41,6 +41,7 @@ TAPS_SCANS = 460
 
 PARSED = {
     r"edge-sr bench .*": "measures for minutes; test_bench runs it",
+    r"edge-sr doctor --rehearse": "takes twenty seconds; test_doctor_command runs it",
     r"edge-sr models --measure": "measures run times for seconds; test_cli runs it",
     r"edge-sr --source demo:loop --sink ros2:.*": "goes on until it is ended; test_ros2 subscribes to its topics",
     r"edge-sr (replay \S+ )?--sink rerun:view": "opens a viewer; test_rerun sends to the package's interface",

@@ -115,17 +115,16 @@ class TestMarks:
 EMULATED = SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, emulated=frozenset({"baseline"}))})
 
 
-def test_a_device_refuses_an_emulated_sensor_unless_forced():
-    words = r"has baseline of an emulated sensor 4, and this is a device: .*--force"
+def test_a_device_refuses_an_emulated_sensor():
+    words = r"has baseline of an emulated sensor 4, and this is a device: .*edge-sr doctor --out"
     with (
         pytest.raises(SensorFileError, match=words),
         Source(FakeLink([], kind="device"), sensor_file=EMULATED),
     ):
         pass
-    for kind, force in (("device", True), ("emulated", False)):
-        with Source(FakeLink([], kind=kind), sensor_file=EMULATED, force=force):
-            pass
-    refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", None, force=False)
+    with Source(FakeLink([], kind="emulated"), sensor_file=EMULATED):
+        pass
+    refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", None)
 
 
 @pytest.mark.parametrize(
@@ -162,12 +161,6 @@ def told(*arguments, link=lambda: FakeLink([WELL], kind="replay"), out=None):
 )
 def test_what_is_not_known_is_not_well(verdicts, words):
     assert summary([Finding("noise", verdict, "") for verdict in verdicts]) == words
-
-
-def test_the_last_line_says_it():
-    code, page = told()
-    findings = [line for line in page.splitlines() if line.startswith("  ?")]
-    assert code == 0 and page.splitlines()[-1] == f"nothing wrong, {len(findings)} not known" and len(findings) == 2
 
 
 @pytest.mark.parametrize("name", ["no/such/s.toml", "", "/proc/s.toml"])

@@ -59,7 +59,6 @@ def test_a_skipped_corners_finger_does_not_count_for_the_next():
     guide = GuidedPress()
     pressed = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(0)])
     answer_to([pressed] * 10, guide)
-    assert guide.felt > 1
     assert guide.type() == "Skipped. Let go."
     more, _ = answer_to([pressed] * 40, guide)
     assert more[1:] == [], "the finger is still there"
@@ -169,24 +168,18 @@ class TestPerson:
         finding = judge_force(guide.weighed, kept=False)
         assert finding.verdict == verdict and guide.weighed.plausible == kept == ("not kept" not in finding.remedy)
 
-    def test_an_unsteady_weight_gives_none(self):
-        laid = np.zeros((7000, 3, 4, 4))
-        laid[:, 2] = (200 + 40 * (np.arange(7000) % 2))[:, None, None]
-        _, guide = answer_to([*visit(), *laid], typed=["200"])
-        assert guide.done and judge_force(guide.weighed, kept=False).verdict == "not known"
-
     @pytest.mark.parametrize(
-        ("course", "steady"),
-        [
-            ("lies", True),
-            ("is laid down", False),
-            ("tilts", False),
-        ],
+        ("course", "steady"), [("lies", True), ("is laid down", False), ("tilts", False), ("sways", False)]
     )
     @pytest.mark.parametrize("noise", [1.0, 2.0, 6.0, 12.0])
     def test_a_weight_is_steady_within_the_noise_of_its_pad(self, course, steady, noise):
         time_s = np.arange(400) / 100
-        share = {"lies": time_s**0, "is laid down": time_s / 5, "tilts": 1 + 0.1 * np.sin(2 * np.pi * time_s)}[course]
+        share = {
+            "lies": time_s**0,
+            "is laid down": time_s / 5,
+            "tilts": 1 + 0.1 * np.sin(2 * np.pi * time_s),
+            "sways": 1 + time_s * 100 % 2,
+        }[course]
         for seed in range(20):
             laid = np.random.default_rng(seed).normal(0, noise, (400, 3, 4, 4))
             laid[:, 2] += 147.1 * share[:, None, None]
@@ -235,27 +228,20 @@ def test_a_grip_gives_a_pad_the_scale_of_its_partner(weighed, rest, found, wrong
 
 
 @pytest.mark.parametrize(
-    ("weighed", "ratio", "verdict"),
-    [({}, 1.0, "not known"), ({}, 0.5, "look"), ({"a": Weighed(1000.0, 0.06)}, 0.7, "ok")],
+    ("weighed", "ratio", "verdict", "found"),
+    [
+        ({}, 1.0, "not known", False),
+        ({}, 0.5, "look", False),
+        ({"a": Weighed(1000.0, 0.06)}, 0.7, "ok", True),
+        ({"a": Weighed(1000.0, 0.06)}, 3.0, "look", False),
+    ],
 )
-def test_without_a_weight_two_pads_are_never_called_alike(weighed, ratio, verdict):
+def test_two_pads_are_called_alike_with_a_weight_and_in_range(weighed, ratio, verdict, found):
     grip = Grip(("a", "b"))
     for scan, z in enumerate([0] * 20 + [8000] * 120 + [0] * 30):
         grip.push("a", scan / 100, ratio * z)
         grip.push("b", scan / 100, z)
-    assert grip.judge(weighed)[-1].verdict == verdict
-
-
-def test_a_pad_gets_no_scale_by_a_partner_that_reads_a_third():
-    grip = Grip(("a", "b"))
-    for scan, z in enumerate([0] * 20 + [4000] * 120 + [0] * 30):
-        grip.push("a", scan / 100, 3 * z)
-        grip.push("b", scan / 100, z)
-    assert [one.verdict for one in grip.judge({"a": Weighed(1000.0, 0.06)})] == [
-        "ok",
-        "ok",
-        "look",
-    ] and not grip.weighed
+    assert (grip.judge(weighed)[-1].verdict, bool(grip.weighed)) == (verdict, found)
 
 
 def test_a_grip_of_one_pad_alone_settles_nothing():

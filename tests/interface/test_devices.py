@@ -2,11 +2,8 @@
 
 import json
 import os
-import pty
 import re
 import subprocess
-import threading
-import tty
 from pathlib import Path
 
 import pytest
@@ -21,7 +18,7 @@ from firmware_bridge.links import gs_usb_link
 from firmware_bridge.links.discovery import Found, can_interfaces, serial_devices
 from firmware_bridge.links.gs_usb_link import GsUsbDevice
 from firmware_bridge.links.serial_ports import Port
-from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.scans.slcan_scans import SlcanScans
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus", "USB-CAN Plus", "VScom")
 GRIPPER = Port("/dev/ttyUSB1", (0x0403, 0x6015), "GRIP1", "FT231X USB UART", "FT231X USB UART", "FTDI")
@@ -148,17 +145,6 @@ def test_everything_is_listed_adapters_first(plugged, gs_usb, capsys):
     assert "  --source gs_usb\n  ! no permission: " in out and "udev" in out and err == ""
 
 
-def test_for_programs(plugged, gs_usb, capsys):
-    plugged[:] = [VSCOM]
-    assert cli.main(["devices", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["notes"] == [] and [one["source"] for one in told["devices"]] == ["slcan:serial=D30BL366"]
-    assert Found(**told["devices"][0])._replace(problems=()) == serial_devices([VSCOM])[0]._replace(problems=())
-    plugged.clear()
-    assert cli.main(["devices", "--json"]) == 3
-    assert json.loads(capsys.readouterr().out) == {"devices": [], "notes": []}
-
-
 def test_usb_that_cannot_be_read_hides_no_port(plugged, gs_usb, capsys, monkeypatch):
     why = "libusb cannot be loaded: pip install libusb-package"
 
@@ -171,19 +157,6 @@ def test_usb_that_cannot_be_read_hides_no_port(plugged, gs_usb, capsys, monkeypa
     assert capsys.readouterr().out.splitlines()[-2:] == [why, SERVER_HINT]
 
 
-def test_the_page_fits_a_narrow_terminal(plugged, gs_usb, capsys, monkeypatch):
-    """All but what is to be typed, which is one line, and whole."""
-    by_path = "/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0-port0"
-    plugged[:] = [VSCOM._replace(path="/dev/ttyUSB9"), BUILT_IN._replace(path=by_path)]
-    gs_usb[:] = [GsUsbDevice(1, 4, (0x1D50, 0x606F), "004B", "candleLight")]
-    monkeypatch.setenv("COLUMNS", "40")
-    assert cli.main(["devices"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert f"  --source slcan:{by_path}" in lines and by_path in lines
-    assert [line for line in lines if len(line) > 40 and by_path not in line] == []
-    assert "  ! " in "".join(lines) and SERVER_HINT in " ".join(lines)
-
-
 SPEAKERS = {
     b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\n": "bytes came, and no CAN frame in them: ",
     b"t1238AABBCCDDEEFF0011\r": "CAN frames came, and ",
@@ -193,31 +166,12 @@ SPEAKERS = {
 
 @pytest.mark.parametrize("said", SPEAKERS)
 def test_what_is_wrong_is_read_from_what_came(said):
-    leader, follower = pty.openpty()
-    tty.setraw(follower)
-    over, name = threading.Event(), os.ttyname(follower)
-
-    def speak():
-        while not over.wait(0.01):
-            os.write(leader, said)
-
-    speaker = threading.Thread(target=speak)
-    speaker.start()
-    try:
-        link = SlcanSerialLink(name)
-        for _ in range(2):  # as a run does while no scan comes
-            with link:
-                heard = link.counters()["received_bytes"]
-                while link.counters()["received_bytes"] < heard + 300:
-                    assert link.read(0.01) == []
-        hint = silence_hint([f"slcan:{name}"], link.counters)
-    finally:
-        over.set()
-        os.write(follower, b"\r")
-        speaker.join()
-        os.close(leader), os.close(follower)
+    stages = SlcanScans()
+    for time_ns in range(0, 100_000_000, 1_000_000):
+        assert stages.feed(said, time_ns) == []
+    hint = silence_hint(["slcan:/dev/ttyUSB0"], stages.counters)
     assert SPEAKERS[said] in hint
-    assert f"edge-sr doctor --source slcan:{name}" in hint or "edge-sr devices" in hint
+    assert "edge-sr doctor --source slcan:/dev/ttyUSB0" in hint or "edge-sr devices" in hint
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Bars on a real pseudo-terminal, none anywhere else; commands of advice; and patterns drawn as text."""
+"""Bars on a real pseudo-terminal, none anywhere else; and commands of advice."""
 
 import contextlib
 import fcntl
@@ -10,17 +10,12 @@ import subprocess
 import termios
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
 from edge_samples import write_model
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from edge.cli import main as cli
 from edge.terminal import progress_bar
-from edge.terminal.heatmap import HALF_BLOCK, Panel, draw, resample, shows_colours
 from edge.terminal.progress_bar import progress
 
 RATE = re.compile(r"scan/s|s/scan")
@@ -132,56 +127,3 @@ def test_commands_of_advice_can_be_typed_whatever_the_file(name, command, advice
     done = subprocess.run(bash, capture_output=True, check=True, env=os.environ | {"LC_ALL": "C.UTF-8"})
     words = done.stdout.decode(errors="surrogateescape").split("\0")
     assert [one for one in words if "." in one] == [one.replace("NAME", name) for one in meant]
-
-
-ESCAPE = re.compile(r"\x1b\[[0-9;]*m")
-
-
-def visible(text):
-    return [ESCAPE.sub("", line) for line in text.splitlines()]
-
-
-def panel(values=None, title="title", low=0.0, high=1.0):
-    return Panel(title, np.eye(4) if values is None else values, low, high, "mm")
-
-
-sizes = st.integers(1, 9)
-digits = st.integers(-9, 9).map(float)
-images = st.tuples(sizes, sizes).flatmap(lambda shape: arrays(np.float64, shape, elements=digits))
-
-
-@settings(deadline=None)
-@given(images, sizes, sizes)
-def test_resampling_is_the_mean_over_each_new_cell(image, height, width):
-    fine = np.kron(image, np.ones((height, width)))
-    exact = fine.reshape(height, image.shape[0], width, image.shape[1]).mean(axis=(1, 3))
-    np.testing.assert_allclose(resample(image, height, width), exact, atol=1e-12)
-
-
-@pytest.mark.parametrize("coloured", [True, False])
-def test_no_line_is_wider_than_the_terminal(coloured):
-    panels = [panel(title="a title longer than some of these terminals"), panel(np.eye(40)), panel(high=1e-7)]
-    for columns in (1, 7, 20, 39, 64, 80, 124, 300):
-        assert max(map(len, visible(draw(panels, columns, coloured)))) <= min(columns, 124)
-
-
-def test_a_cell_shows_the_upper_pixel_over_the_lower():
-    values = np.zeros((40, 40))
-    values[0] = 1.0
-    line = draw([panel(values)], 40, True).splitlines()[1]
-    assert line == f"\x1b[38;5;220;48;5;53m{HALF_BLOCK * 40}\x1b[0m"
-
-
-@pytest.mark.parametrize(
-    ("environment", "terminal", "encoding", "coloured"),
-    [
-        ({"TERM": "xterm", "NO_COLOR": ""}, True, "utf-8", True),
-        ({"TERM": "xterm", "NO_COLOR": "1"}, True, "utf-8", False),
-        ({"TERM": "dumb"}, True, "utf-8", False),
-        ({"TERM": "xterm"}, False, "utf-8", False),
-        ({"TERM": "xterm"}, True, "latin-1", False),
-        ({"TERM": "xterm"}, True, "no such encoding", False),
-    ],
-)
-def test_colours_are_shown_where_the_output_can(environment, terminal, encoding, coloured):
-    assert shows_colours(environment, terminal=terminal, encoding=encoding) == coloured

@@ -166,7 +166,7 @@ def test_a_replay_that_waits_for_a_stopped_peer_still_ends(endpoint, consume, tm
     model, consumer = write_model(tmp_path / "tiny.onnx", CONTRACT), consume(endpoint)
     counts = make_scan(0).counts + np.random.default_rng(1).integers(-2, 3, (8000, 3, 4, 4))
     counts[110:, 2] += ((2000 + 7 * np.arange(7890) % 997) // 16)[:, None, None]
-    replay = ["replay", write_recording(tmp_path / "long.csv", counts), "--zero", "--rate-hz", 2000, "--model", model]
+    replay = ["replay", write_recording(tmp_path / "long.csv", counts), "--rate-hz", 2000, "--model", model]
     sinks = ["--sink", "jsonl:-", "--sink", f"zenoh:grip?connect={endpoint}"]
     with ended(start(*replay, *sinks, "--every-scan")) as program:
         while consumer.next()[0] != "got":

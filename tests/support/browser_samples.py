@@ -20,7 +20,7 @@ from packed_messages import unpack
 
 from edge.api import load_model
 from edge.inference.bundled import demo_recording
-from edge.terminal.heatmap import colours
+from edge.mapping.colours import colours
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
