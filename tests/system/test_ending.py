@@ -43,7 +43,9 @@ from edge.terminal.stop_signals import stop_on_signals
 from edge.pipeline.commands import Commands, terminal_keys
 
 lock, library = ctypes.create_string_buffer(64), ctypes.CDLL(None)
-with stop_on_signals(), terminal_keys(Commands()):
+commands = Commands()
+with stop_on_signals(), terminal_keys(commands):
+    commands.poll()
     while True:
         library.pthread_mutex_lock(lock)
 """
