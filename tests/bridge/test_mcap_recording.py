@@ -1,5 +1,6 @@
 """Recordings in MCAP: read by public packages, played again bit for bit, whole whatever ended their writer."""
 
+import hashlib
 import json
 import threading
 import time
@@ -344,3 +345,13 @@ def test_two_mountings_of_one_sensor_are_refused(turned, tmp_path):
     straight = record_into(tmp_path / "straight.mcap", make_results([make_scan()]), mountings={"4": Mounting()})
     with pytest.raises(RecordingError, match="two mountings of sensor '4'"):
         load_recording(messages_alone(turned, tmp_path / "both.mcap", more=straight))
+
+
+def test_recordings_of_before_stay_readable(tmp_path):
+    """The reader takes the messages of a recording by the text of their definition, comments and all."""
+    path = record_into(tmp_path / "press.mcap", make_results([make_scan(0)]))
+    with path.open("rb") as file:
+        schemas = make_reader(file).get_summary().schemas.values()
+    texts = {schema.name.rpartition("/")[2]: hashlib.sha256(schema.data).hexdigest()[:12] for schema in schemas}
+    recorded = {"Scan": "6a35e40d3860", "Baseline": "e3ede75454cb", "Sensor": "54829f0a30b8"}
+    assert recorded.items() <= texts.items()
