@@ -155,6 +155,17 @@ def test_deformation_is_the_short_way_round(rest, pressed, half, unknown):
     assert (seen[:, ~gaps] == pressed + half).all()
 
 
+def test_from_counts_takes_what_it_is_given():
+    counts = still(20)
+    counts[15:, 2] += 4000
+    baseline = Baseline.from_counts("6", counts, 99.0)
+    assert (baseline.counts == np.median(counts, axis=0)).all()
+    assert (baseline.sensor, baseline.scans, baseline.created_unix_s) == ("6", 20, 99.0)
+    counts[3, 1, 2, 2] = 65_536
+    with pytest.raises(BaselineRefusedError, match="to 65536, expected"):
+        Baseline.from_counts("6", counts, 99.0)
+
+
 def test_a_taxel_given_up_has_no_rest_until_the_next_zeroing():
     counts = still(200)
     counts[:, :, 1, 1] = ABSENT

