@@ -9,7 +9,6 @@ import sys
 import time
 from dataclasses import replace
 
-import numpy as np
 import program_cost
 import pytest
 from cli_samples import run
@@ -19,7 +18,7 @@ from edge.bench import command
 from edge.bench import provenance as reports
 from edge.bench.command import front
 from edge.bench.provenance import UNKNOWN, file_hash, provenance, read_provenance, with_head
-from edge.bench.subjects import FORCE_RANGE_N, Subject, error_rows, force_error_percent, force_floor_percent
+from edge.bench.subjects import Subject, error_rows
 from edge.bench.timing import back_to_back, paced
 from edge.cli.main import main
 from edge.evaluation.test_set import judge_model, load_frozen_set, mean_error
@@ -52,7 +51,7 @@ def test_everyone_has_its_error_and_its_run_time(bench):
     assert [row["method"] for row in rows if row["psnr_db"]] == ["bilinear", "mine/tiny"]
     timed = [row for row in rows if row["paced_p50_us"]]
     assert [row["method"] for row in timed] == ["bilinear", "mine/coarse", "mine/tiny"]
-    assert all(float(row["paced_p50_us"]) > 0 and float(row["start_up_ms"]) > 0 for row in timed)
+    assert all(float(row["paced_p50_us"]) > 0 for row in timed)
 
 
 def test_a_broken_model_is_left_out_and_another_scale_only_timed(bench):
@@ -77,19 +76,8 @@ def test_the_error_is_that_which_contracts_are_judged_by():
     rows = list(error_rows(MTSR, some))
     assert [row.given for row in rows] == [1, session.contract.taps]
     for row in rows:
-        expected = mean_error(judge_model(session, some, row.given))
-        assert expected.keys() == session.contract.test_error[str(row.given)].keys()
-        assert {key: row.error[key] for key in expected} == expected
-
-
-def test_force_is_a_patterns_sum_by_the_true_patterns_factor():
-    volume = FROZEN.patterns().sum(axis=(1, 2), dtype=np.float64)
-    factor = (volume @ FROZEN.force_n) / (volume @ volume)
-    floor = 100 * np.sqrt(np.mean((factor * volume - FROZEN.force_n) ** 2)) / FORCE_RANGE_N
-    assert force_floor_percent(FROZEN) == pytest.approx(floor, rel=1e-4)
-    nothing = 100 * np.sqrt(np.mean(FROZEN.force_n.astype(float) ** 2)) / FORCE_RANGE_N
-    assert force_error_percent(0 * FROZEN.patterns(), FROZEN) == pytest.approx(nothing, rel=1e-4)
-    assert FROZEN.force_n.max() == pytest.approx(FORCE_RANGE_N)
+        assert row.error == mean_error(judge_model(session, some, row.given))
+        assert row.error.keys() == session.contract.test_error[str(row.given)].keys()
 
 
 @pytest.mark.parametrize(
@@ -110,8 +98,8 @@ def test_unusable_input_is_said_in_a_line_before_measuring(arguments, complaint,
 
 def test_a_child_that_fails_is_named_with_its_reason():
     subject = {"name": "lost", "path": "/nowhere.onnx"}
-    with pytest.raises(command.BenchError, match=r"first of lost failed: /nowhere.onnx: cannot be read"):
-        command.measured({"do": "first", "subject": subject, "threads": 1, "window": []})
+    with pytest.raises(command.BenchError, match=r"of lost was not measured: /nowhere.onnx: cannot be read"):
+        command.measured({"subject": subject, "rate_hz": 100.0, "ticks": 1})
 
 
 def in_group(group: int) -> bool:
