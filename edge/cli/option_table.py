@@ -224,7 +224,6 @@ new file cannot hold is printed. Nothing is computed, and no file is replaced.
             Group(
                 "map",
                 Option("--out FILE", Path, "file for the map's layers (default %(default)s)", default=Path("map.npz")),
-                Option("--png FILE", Path, "file for a picture of contact and height"),
                 Option("--size-mm L", positive, "length of its sides in mm (default %(default)g)", default=SIZE_MM),
                 Option("--px-per-mm N", positive, "pixels of the map per mm (default %(default)g)", default=PX_PER_MM),
                 Option(

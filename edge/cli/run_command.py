@@ -166,11 +166,10 @@ def map_object(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Run `edge-sr map`: a run whose results make a map, which is reported at the end, however the run ends."""
     from edge.api import MapSink, ObjectMap
 
-    for path, ending in ((options.out, ".npz"), (options.png, ".png")):
-        if path is not None and path.suffix != ending:
-            raise UsageError(f"{path} is no name of a map's file: expected one that ends in {ending}")
+    if options.out.suffix != ".npz":
+        raise UsageError(f"{options.out} is no name of a map's file: expected one that ends in .npz")
     whole = ObjectMap(options.size_mm, options.px_per_mm, centre_mm=tuple(options.centre_mm))
-    sink = MapSink(whole, npz=options.out, png=options.png)
+    sink = MapSink(whole, npz=options.out)
     try:
         follow(options, out, err, mapping=sink)
     finally:
