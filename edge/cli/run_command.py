@@ -94,7 +94,6 @@ def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         zero=options.baseline is not None,
         paced=paced,
         rate_hz=options.rate_hz,
-        bar=not paced and "status" not in options.sink,
         begins=looked_at,
     )
     run(options, source, looked_at=looked_at)
@@ -237,7 +236,7 @@ def run(
             fan = Fan(messages.say)
             closing.callback(fan.close)
             sinks.append(messages)
-            wanted = _with_status(options.sink, source)
+            wanted = _with_status(options.sink)
             if "status" in wanted and sys.stdin is not None and sys.stdin.isatty():
                 keys = "keys: r forgets earlier taps, z zeroes the free pad, Z zeroes even in contact"
                 print(f"edge-sr: {keys}", file=sys.stderr)
@@ -308,7 +307,7 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
                     print(time.strftime("recorded on %Y-%m-%d at %H:%M", made), file=sys.stderr)
 
 
-def _with_status(sinks: Sequence[str], source: Source) -> list[str]:
-    """The sinks asked for, and on a terminal the live line; not where records may go there, or it is over at once."""
-    live = sys.stderr is not None and sys.stderr.isatty() and not source.patient
+def _with_status(sinks: Sequence[str]) -> list[str]:
+    """The sinks asked for, and on a terminal the live line; not where records may go there."""
+    live = sys.stderr is not None and sys.stderr.isatty()
     return [*sinks, "status"] if live and not {"status", "jsonl:-"} & set(sinks) else list(sinks)
