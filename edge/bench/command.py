@@ -15,7 +15,6 @@ from typing import Any, Final, TextIO
 from edge.bench.provenance import provenance, this_machine, with_head
 from edge.bench.subjects import (
     FROZEN_FILE,
-    ErrorRow,
     Subject,
     chosen,
     error_rows,
@@ -24,6 +23,7 @@ from edge.bench.subjects import (
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
+RATE_HZ: Final = 100.0
 _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
 
 
@@ -79,13 +79,12 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     date = datetime.now(UTC).isoformat(timespec="seconds")
     page.say(
         f"# Error against run time\n\n{date}, `{command}`\n\n{this_machine()}. {options.ticks} ticks a row at "
-        f"{options.rate_hz:g} Hz{few}, on one thread, as the program runs."
+        f"{RATE_HZ:g} Hz{few}, on one thread, as the program runs."
     )
     lines: list[dict[str, Any]] = []
     try:
-        errors = _errors(everyone, frozen, lines, page)
+        _errors(everyone, frozen, lines, page)
         _run_times(everyone, options, lines, page)
-        _front(errors, lines, page)
     except KeyboardInterrupt:
         kept = f": what was measured is in {options.out}" if options.out else ""
         page.warn(f"bench stopped before its end{kept}")
@@ -97,21 +96,16 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     return 0
 
 
-def _errors(
-    everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str, Any]], page: BenchPage
-) -> list[ErrorRow]:
+def _errors(everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str, Any]], page: BenchPage) -> None:
     columns = ("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %")
     page.section("Error", "Frozen test set, means over all frames.", columns)
-    rows: list[ErrorRow] = []
     for subject in everyone:
         try:
             for row in error_rows(subject, frozen):
-                rows.append(row)
                 lines.append({"method": row.name, "taps_given": row.given} | row.error)
                 page.row((row.name, str(row.given), *_error_cells(row.error)))
         except EdgeError as error:
             page.warn(f"run time only of {subject.name}: {error}")
-    return rows
 
 
 def _error_cells(error: dict[str, float]) -> tuple[str, ...]:
@@ -131,14 +125,14 @@ def _run_times(
     page: BenchPage,
 ) -> None:
     columns = ("method", *(f"back to back {figure}" for figure in _FIGURES.values()))
-    columns += (*(f"{options.rate_hz:g} Hz {figure}" for figure in _FIGURES.values()), "missed", "CPU %")
+    columns += (*(f"{RATE_HZ:g} Hz {figure}" for figure in _FIGURES.values()), "missed", "CPU %")
     text = (
         "Each row in a process of its own, with all taps that the method takes; only a model that takes poses is "
         "faster with fewer, and not measured so. Missed: ticks whose inference was not done when the next was due."
     )
     page.section("Run time", text, columns)
     for subject in everyone:
-        answer = measured({"subject": subject._asdict(), "rate_hz": options.rate_hz, "ticks": options.ticks})
+        answer = measured({"subject": subject._asdict(), "rate_hz": RATE_HZ, "ticks": options.ticks})
         paced, both = answer["paced"], {"back_to_back": answer["back_to_back"], "paced": answer["paced"]["times"]}
         cells = [cell for times in both.values() for cell in _percentiles(times)]
         cells += [f"{paced['missed']} of {paced['ticks']}", f"{paced['cpu_percent']:.1f}"]
@@ -170,25 +164,6 @@ def measured(job: dict[str, Any]) -> dict[str, Any]:
 def _percentiles(times: dict[str, Any]) -> tuple[str, str, str, str]:
     p999 = "-" if times["runs"] < 1000 else f"{times['p999_us']:.0f}"
     return f"{times['p50_us']:.0f}", f"{times['p99_us']:.0f}", p999, f"{times['max_us']:.0f}"
-
-
-def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], page: BenchPage) -> None:
-    paced_us = {row["method"]: row["paced_p50_us"] for row in lines if "paced_p50_us" in row}
-    rows = sorted((row for row in errors if row.name in paced_us), key=lambda row: paced_us[row.name])
-    if not rows:
-        return
-    text = "* is on the Pareto front: no other is at least as good in both RMSE and paced p50."
-    columns = ("front", "method", "taps given", "RMSE %", "PSNR dB", "paced p50 us")
-    page.section("Pareto front", text, columns)
-    best = front([(row.error["rmse_percent"], paced_us[row.name]) for row in rows])
-    for row, is_best in zip(rows, best, strict=True):
-        figures = (f"{row.error['rmse_percent']:.2f}", f"{row.error['psnr_db']:.2f}", f"{paced_us[row.name]:.0f}")
-        page.row(("*" if is_best else "", row.name, str(row.given), *figures))
-
-
-def front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Return, for each point, True if no other point is at least as small in both numbers and smaller in one."""
-    return [not any(o != p and o[0] <= p[0] and o[1] <= p[1] for o in points) for p in points]
 
 
 def _write(
