@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from edge.evaluation.metrics import psnr_db
 from edge.inference.bundled import POSED_MODEL, demo_recording, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.mapping.colours import colours
 
 SIDE_PX: Final = 180
 SMALL_PX: Final = 80
@@ -21,7 +21,7 @@ GAP_PX: Final = 24
 
 def squares(values: NDArray[np.floating], high: float, left: float, top: float, side: float) -> str:
     """Return a map (H, W) as rectangles, with runs of one colour joined."""
-    rgb = np.rint(colours(np.clip(values / high, 0, 1))).astype(int)
+    rgb = np.rint(255 * colormaps["viridis"](np.clip(values / high, 0, 1))[..., :3]).astype(int)
     height, width = values.shape
     parts = []
     for row in range(height):

@@ -7,28 +7,23 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TextIO
 
-import numpy as np
-
 from edge.bench.provenance import provenance, this_machine, with_head
 from edge.bench.subjects import (
-    FORCE_RANGE_N,
     FROZEN_FILE,
-    ErrorRow,
     Subject,
     chosen,
     error_rows,
-    force_floor_percent,
     subjects,
 )
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
+RATE_HZ: Final = 100.0
 _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
 
 
@@ -84,13 +79,12 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     date = datetime.now(UTC).isoformat(timespec="seconds")
     page.say(
         f"# Error against run time\n\n{date}, `{command}`\n\n{this_machine()}. {options.ticks} ticks a row at "
-        f"{options.rate_hz:g} Hz{few}, on one thread, as the program runs."
+        f"{RATE_HZ:g} Hz{few}, on one thread, as the program runs."
     )
     lines: list[dict[str, Any]] = []
     try:
-        errors = _errors(everyone, frozen, lines, page)
-        _run_times(everyone, options, frozen, lines, page)
-        _front(errors, lines, page)
+        _errors(everyone, frozen, lines, page)
+        _run_times(everyone, options, lines, page)
     except KeyboardInterrupt:
         kept = f": what was measured is in {options.out}" if options.out else ""
         page.warn(f"bench stopped before its end{kept}")
@@ -102,26 +96,16 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     return 0
 
 
-def _errors(
-    everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str, Any]], page: BenchPage
-) -> list[ErrorRow]:
-    text = (
-        f"Frozen test set, means over all frames. Force error is RMS in % of {FORCE_RANGE_N:g} N, of what patterns sum "
-        f"up to, by the one factor that suits true patterns best: those themselves are "
-        f"{force_floor_percent(frozen):.2f} % off."
-    )
+def _errors(everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str, Any]], page: BenchPage) -> None:
     columns = ("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %")
-    page.section("Error", text, (*columns, "force error %"))
-    rows: list[ErrorRow] = []
+    page.section("Error", "Frozen test set, means over all frames.", columns)
     for subject in everyone:
         try:
             for row in error_rows(subject, frozen):
-                rows.append(row)
                 lines.append({"method": row.name, "taps_given": row.given} | row.error)
                 page.row((row.name, str(row.given), *_error_cells(row.error)))
         except EdgeError as error:
             page.warn(f"run time only of {subject.name}: {error}")
-    return rows
 
 
 def _error_cells(error: dict[str, float]) -> tuple[str, ...]:
@@ -131,43 +115,35 @@ def _error_cells(error: dict[str, float]) -> tuple[str, ...]:
         *(f"{error[name]:.3f}" for name in ("ssim", "ssim_global", "contact_iou")),
         f"{error['boundary_mm']:.2f}",
         f"{100 * error['coverage_90']:.1f}" if "coverage_90" in error else "-",
-        f"{error['force_percent']:.2f}",
     )
 
 
 def _run_times(
     everyone: Sequence[Subject],
     options: argparse.Namespace,
-    frozen: FrozenSet,
     lines: list[dict[str, Any]],
     page: BenchPage,
 ) -> None:
     columns = ("method", *(f"back to back {figure}" for figure in _FIGURES.values()))
-    columns += (*(f"{options.rate_hz:g} Hz {figure}" for figure in _FIGURES.values()), "missed", "CPU %")
+    columns += (*(f"{RATE_HZ:g} Hz {figure}" for figure in _FIGURES.values()), "missed", "CPU %")
     text = (
         "Each row in a process of its own, with all taps that the method takes; only a model that takes poses is "
-        "faster with fewer, and not measured so. Missed: ticks whose inference was not done when the next was due. "
-        "Start-up is from the spawn to the first pattern, MB the most memory resident till then."
+        "faster with fewer, and not measured so. Missed: ticks whose inference was not done when the next was due."
     )
-    page.section("Run time", text, (*columns, "start-up ms", "MB"))
-    window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
+    page.section("Run time", text, columns)
     for subject in everyone:
-        job = {"subject": subject._asdict(), "threads": 1}
-        starts = 5 if options.ticks >= 300 else 1
-        start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, starts)
-        answer = measured(job | {"do": "time", "rate_hz": options.rate_hz, "ticks": options.ticks})
+        answer = measured({"subject": subject._asdict(), "rate_hz": RATE_HZ, "ticks": options.ticks})
         paced, both = answer["paced"], {"back_to_back": answer["back_to_back"], "paced": answer["paced"]["times"]}
         cells = [cell for times in both.values() for cell in _percentiles(times)]
-        cells += [f"{paced['missed']} of {paced['ticks']}", f"{paced['cpu_percent']:.1f}", f"{start_up_ms:.0f}"]
-        page.row((subject.name, *cells, "-" if resident_mb is None else f"{resident_mb:.0f}"))
+        cells += [f"{paced['missed']} of {paced['ticks']}", f"{paced['cpu_percent']:.1f}"]
+        page.row((subject.name, *cells))
         figures = {f"{how}_{figure}": times[figure] for how, times in both.items() for figure in _FIGURES}
         figures |= {"missed": paced["missed"], "cpu_percent": paced["cpu_percent"]}
-        about = {"method": subject.name, "start_up_ms": start_up_ms, "resident_mb": resident_mb}
-        lines.append(about | figures)
+        lines.append({"method": subject.name} | figures)
 
 
 def measured(job: dict[str, Any]) -> dict[str, Any]:
-    """Return a child's result of a job of `edge.bench.timing`; raises BenchError, with its last line, if it failed."""
+    """Return a child's run times by `edge.bench.timing`; raises BenchError, with its last line, if it failed."""
     # The child imports the same modules as this process, however they were located.
     script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.timing import main; sys.exit(main())"
     libraries = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM")
@@ -181,48 +157,13 @@ def measured(job: dict[str, Any]) -> dict[str, Any]:
             child.kill()  # after a Ctrl-C, Popen itself would leave it running
     if child.returncode != 0:
         last = (complaint.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
-        raise BenchError(f"{job['do']} of {job.get('subject', {}).get('name', 'the machine')} failed: {last}")
+        raise BenchError(f"the run time of {job['subject']['name']} was not measured: {last}")
     return json.loads(output)
-
-
-def start_up(job: dict[str, Any], starts: int = 5) -> tuple[float, float | None]:
-    """Return the time from the spawn of a process to its first pattern in [ms], imports and all, and its memory.
-
-    Both are medians of so many starts; the memory is the most resident until then, in [MB], None where it is not shown.
-    """
-    took_ms: list[float] = []
-    resident_mb: list[float] = []
-    for _ in range(starts):
-        spawned_ns = time.monotonic_ns()  # one clock for all processes of a machine
-        answer = measured(job)
-        took_ms.append((answer["first_ns"] - spawned_ns) / 1e6)
-        if answer["resident_mb"] is not None:
-            resident_mb.append(answer["resident_mb"])
-    return float(np.median(took_ms)), float(np.median(resident_mb)) if resident_mb else None
 
 
 def _percentiles(times: dict[str, Any]) -> tuple[str, str, str, str]:
     p999 = "-" if times["runs"] < 1000 else f"{times['p999_us']:.0f}"
     return f"{times['p50_us']:.0f}", f"{times['p99_us']:.0f}", p999, f"{times['max_us']:.0f}"
-
-
-def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], page: BenchPage) -> None:
-    paced_us = {row["method"]: row["paced_p50_us"] for row in lines if "paced_p50_us" in row}
-    rows = sorted((row for row in errors if row.name in paced_us), key=lambda row: paced_us[row.name])
-    if not rows:
-        return
-    text = "* is on the Pareto front: no other is at least as good in both RMSE and paced p50."
-    columns = ("front", "method", "taps given", "RMSE %", "PSNR dB", "paced p50 us")
-    page.section("Pareto front", text, columns)
-    best = front([(row.error["rmse_percent"], paced_us[row.name]) for row in rows])
-    for row, is_best in zip(rows, best, strict=True):
-        figures = (f"{row.error['rmse_percent']:.2f}", f"{row.error['psnr_db']:.2f}", f"{paced_us[row.name]:.0f}")
-        page.row(("*" if is_best else "", row.name, str(row.given), *figures))
-
-
-def front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Return, for each point, True if no other point is at least as small in both numbers and smaller in one."""
-    return [not any(o != p and o[0] <= p[0] and o[1] <= p[1] for o in points) for p in points]
 
 
 def _write(

@@ -11,16 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import ModelError, UsageError
-from edge.evaluation.classical_methods import CONTACT_LEVEL, fit_gain, fitted_methods
-from edge.evaluation.metrics import volume_mm3
+from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods
 from edge.evaluation.test_set import FrozenSet, infer_with_intervals, judge, mean_error
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.onnx_session import ModelSession
-from firmware_bridge.pad_geometry import USPA44
 
 FROZEN_FILE: Final = BUNDLE_DIR / "frozen.npz"
 CLASSICAL_FILE: Final = BUNDLE_DIR / "classical.npz"
-FORCE_RANGE_N: Final = 5.0  # force at which every tap of a frozen set ends, unless the sensor's depth limit comes first
 
 Infer = Callable[[NDArray[np.float32]], object]
 """Inference on a window (K, 3, rows, cols) in zeroed counts, of as many taps as it takes or more."""
@@ -70,18 +67,18 @@ def chosen(everyone: list[Subject], names: list[str] | None) -> list[Subject]:
     return [subject for subject in everyone if subject.name in names]
 
 
-def opened(subject: Subject, threads: int) -> Infer:
+def opened(subject: Subject) -> Infer:
     """Return the subject ready to run."""
     if subject.path is None:
         method = fitted_methods(CLASSICAL_FILE, subject.scale)[subject.name]
         return lambda window: method(window[None, 0])
-    model = ModelSession(Path(subject.path), threads)
+    model = ModelSession(Path(subject.path))
     taps, scale_window = model.contract.taps, model.contract.scale_window
     return lambda window: model.run(scale_window(window[:taps]))
 
 
 class ErrorRow(NamedTuple):
-    """Errors of a subject that is given its newest taps: the mean of each metric over all frames, and of the force."""
+    """Errors of a subject that is given its newest taps: the mean of each metric over all frames."""
 
     name: str
     given: int
@@ -99,9 +96,7 @@ def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
     def row(
         given: int, patterns: NDArray[np.floating], level: float, half_width_mm: NDArray[np.floating] | None = None
     ) -> ErrorRow:
-        error = mean_error(judge(patterns, frozen, level, half_width_mm))
-        force_percent = round(force_error_percent(patterns, frozen), 4)
-        return ErrorRow(subject.name, given, error | {"force_percent": force_percent})
+        return ErrorRow(subject.name, given, mean_error(judge(patterns, frozen, level, half_width_mm)))
 
     if subject.path is None:
         method = fitted_methods(CLASSICAL_FILE, frozen.scale)[subject.name]
@@ -114,22 +109,3 @@ def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
     for given in sorted({1, contract.taps}):
         patterns, half_width_mm = infer_with_intervals(session, frozen, given)
         yield row(given, patterns, contract.contact_level, half_width_mm)
-
-
-def force_error_percent(patterns: NDArray[np.floating], frozen: FrozenSet) -> float:
-    """Return the RMS error of the force that patterns (n, H, W) in [mm] sum up to, in [% of FORCE_RANGE_N].
-
-    A pattern's deformation summed over its area becomes newtons by one factor, the same for every subject: the one that
-    brings the true patterns nearest to the true forces, least squares, no offset. It is not fitted to the evaluated
-    patterns: a pattern that is too deep on the whole is an error. Shapes have factors of their own, so true patterns
-    are off too, which is the floor of the error (`force_floor_percent`).
-    """
-    pixel_mm = USPA44.pixel_pitch_mm(frozen.scale)
-    newtons_per_mm3 = fit_gain(volume_mm3(frozen.patterns(), pixel_mm), frozen.force_n)
-    error_n = newtons_per_mm3 * volume_mm3(patterns, pixel_mm) - frozen.force_n
-    return 100 * float(np.sqrt(np.mean(np.square(error_n, dtype=np.float64)))) / FORCE_RANGE_N
-
-
-def force_floor_percent(frozen: FrozenSet) -> float:
-    """Return the `force_error_percent` of the true patterns."""
-    return force_error_percent(frozen.patterns(), frozen)

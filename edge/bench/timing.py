@@ -8,13 +8,13 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from edge.bench.subjects import FROZEN_FILE, Subject, opened
 from edge.errors import EdgeError
+from edge.evaluation.test_set import load_frozen_set
 from firmware_bridge.schedule import Clock, Sleep, Ticker
 
 Run = Callable[[int], object]  # one inference; its argument is a number that selects the input
@@ -95,10 +95,9 @@ def paced(
 
 
 def main() -> int:
-    """Do a job, of which "do" is the name in JOBS; returns 1, with a line on stderr, where it cannot be done."""
-    job = json.load(sys.stdin)
+    """Do the job on stdin; returns 1, with a line on stderr, where it cannot be done."""
     try:
-        result = JOBS[job.pop("do")](**job)
+        result = _time(**json.load(sys.stdin))
     except EdgeError as error:
         sys.stderr.write(f"{' '.join(str(error).split())}\n")
         return 1
@@ -106,28 +105,13 @@ def main() -> int:
     return 0
 
 
-def _first(subject: dict[str, Any], threads: int, window: list[Any]) -> dict[str, Any]:
-    """Return the time of the first pattern, and the most memory in [MB] that this process has held by then."""
-    infer = opened(Subject(**subject), threads)
-    infer(np.array(window, dtype=np.float32))
-    first_ns, status = time.monotonic_ns(), Path("/proc/self/status")
-    lines = status.read_text().splitlines() if status.exists() else []
-    resident_mb = next((int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM:")), None)
-    return {"first_ns": first_ns, "resident_mb": resident_mb}
-
-
-def _time(subject: dict[str, Any], threads: int, rate_hz: float, ticks: int) -> dict[str, Any]:
+def _time(subject: dict[str, Any], rate_hz: float, ticks: int) -> dict[str, Any]:
     """Return run times on the test set's windows in turn, with all taps that there are."""
-    from edge.evaluation.test_set import load_frozen_set  # here, or it would add to the start-up
-
     frozen = load_frozen_set(FROZEN_FILE)
     windows = frozen.windows(1 + frozen.earlier.shape[1])
-    infer = opened(Subject(**subject), threads)
+    infer = opened(Subject(**subject))
 
     def run(number: int) -> object:
         return infer(windows[number % len(windows)])
 
     return {"back_to_back": asdict(back_to_back(run, ticks)), "paced": asdict(paced(run, rate_hz, ticks))}
-
-
-JOBS: Final = {"first": _first, "time": _time}

@@ -224,7 +224,6 @@ new file cannot hold is printed. Nothing is computed, and no file is replaced.
             Group(
                 "map",
                 Option("--out FILE", Path, "file for the map's layers (default %(default)s)", default=Path("map.npz")),
-                Option("--png FILE", Path, "file for a picture of contact and height"),
                 Option("--size-mm L", positive, "length of its sides in mm (default %(default)g)", default=SIZE_MM),
                 Option("--px-per-mm N", positive, "pixels of the map per mm (default %(default)g)", default=PX_PER_MM),
                 Option(
@@ -312,15 +311,14 @@ Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong 
             Group(
                 None,
                 Option("--out DIR", Path, "folder for bench.csv and bench.md"),
-                Option("--rate-hz R", positive, "paced ticks a second (default 100)", default=100.0),
                 Option("--ticks N", whole(10), "paced ticks a row (default 3000)", default=3000),
                 Option("--models DIR", Path, "folder of your own models, measured as well"),
                 Option("--only NAME", str, "measure only these methods", nargs="+"),
             ),
         ),
         """\
-Run time is measured back to back, and paced: one inference a tick, as on a robot. A row takes half a minute. No other \
-program should run meanwhile.
+Run time is measured back to back, and paced: one inference a tick, at 100 Hz, as on a robot. A row takes half a \
+minute. No other program should run meanwhile.
 
 Ctrl-C ends it with exit code 130, after the rows measured so far are written.
 """,

@@ -94,7 +94,6 @@ def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         zero=options.baseline is not None,
         paced=paced,
         rate_hz=options.rate_hz,
-        bar=not paced and "status" not in options.sink,
         begins=looked_at,
     )
     run(options, source, looked_at=looked_at)
@@ -166,11 +165,10 @@ def map_object(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Run `edge-sr map`: a run whose results make a map, which is reported at the end, however the run ends."""
     from edge.api import MapSink, ObjectMap
 
-    for path, ending in ((options.out, ".npz"), (options.png, ".png")):
-        if path is not None and path.suffix != ending:
-            raise UsageError(f"{path} is no name of a map's file: expected one that ends in {ending}")
+    if options.out.suffix != ".npz":
+        raise UsageError(f"{options.out} is no name of a map's file: expected one that ends in .npz")
     whole = ObjectMap(options.size_mm, options.px_per_mm, centre_mm=tuple(options.centre_mm))
-    sink = MapSink(whole, npz=options.out, png=options.png)
+    sink = MapSink(whole, npz=options.out)
     try:
         follow(options, out, err, mapping=sink)
     finally:
@@ -238,7 +236,7 @@ def run(
             fan = Fan(messages.say)
             closing.callback(fan.close)
             sinks.append(messages)
-            wanted = _with_status(options.sink, source)
+            wanted = _with_status(options.sink)
             if "status" in wanted and sys.stdin is not None and sys.stdin.isatty():
                 keys = "keys: r forgets earlier taps, z zeroes the free pad, Z zeroes even in contact"
                 print(f"edge-sr: {keys}", file=sys.stderr)
@@ -309,7 +307,7 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
                     print(time.strftime("recorded on %Y-%m-%d at %H:%M", made), file=sys.stderr)
 
 
-def _with_status(sinks: Sequence[str], source: Source) -> list[str]:
-    """The sinks asked for, and on a terminal the live line; not where records may go there, or it is over at once."""
-    live = sys.stderr is not None and sys.stderr.isatty() and not source.patient
+def _with_status(sinks: Sequence[str]) -> list[str]:
+    """The sinks asked for, and on a terminal the live line; not where records may go there."""
+    live = sys.stderr is not None and sys.stderr.isatty()
     return [*sinks, "status"] if live and not {"status", "jsonl:-"} & set(sinks) else list(sinks)

@@ -100,11 +100,6 @@ def _outlines(touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return touching & ~inside
 
 
-def volume_mm3(patterns: ArrayLike, pixel_mm: float) -> NDArray[np.floating]:
-    """Return the volume of patterns (..., H, W) in [mm] over their area, (...) in [mm3]."""
-    return np.asarray(patterns).sum(axis=(-2, -1)) * pixel_mm**2
-
-
 def interval_coverage(pattern: ArrayLike, truth: ArrayLike, half_width: ArrayLike) -> NDArray[np.float64]:
     """Return the share of pixels whose truth is within `half_width` of the pattern, (..., H, W) in the same unit."""
     errors = np.abs(np.asarray(pattern) - np.asarray(truth))

@@ -1,11 +1,9 @@
-"""Sink that fuses the results of a run into a map, shows it now and then, and writes its npz and PNG at the end.
+"""Sink that fuses the results of a run into a map, shows it now and then, and writes its npz at the end.
 
 A reset stands for a new object, so that it ends the map and begins the next.
 """
 
-import struct
 import time
-import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -59,25 +57,23 @@ class MapSink(Sink):
         whole: ObjectMap,
         *,
         npz: Path | None = None,
-        png: Path | None = None,
         show: Callable[[MapState], object] | None = None,
         origin: SourceKind | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Check that the files can be written: layers and picture, on `close` and at a reset; later ones are numbered.
+        """Check that the file can be written, with the layers, on `close` and at a reset; later ones are numbered.
 
         `show` is called with the map's state a few times a second and must not wait. `origin` is the kind of source
-        that the scans of a recording come from. Raises a SinkError where a file exists, or cannot be written.
+        that the scans of a recording come from. Raises a SinkError where the file exists, or cannot be written.
         """
         self.whole = whole
         self.without_pose = self.together = 0
         self.show, self.origin = show, origin
         self._before: Counter[str] = Counter()
         self._written: list[Path] = []
-        self._files = [(path, save) for path, save in ((npz, save_npz), (png, save_png)) if path]
-        self._first_files = self._files
-        for path, _ in self._files:
-            check_new(path)
+        self._path = self._first_path = npz
+        if npz is not None:
+            check_new(npz)
         self._facts: dict[str, str] = {}
         self._pads: dict[str, tuple[PadPose, int]] = {}
         self._clock_ns = clock_ns
@@ -121,7 +117,7 @@ class MapSink(Sink):
         self._show()
 
     def close(self) -> None:
-        """Take the presses that have not ended, show the last state, and write the files; nothing fused, no file."""
+        """Take the presses that have not ended, show the last state, and write the file; nothing fused, no file."""
         self._save()
         self._due_ns, self._unseen = 0, True
         self._show()
@@ -153,23 +149,22 @@ class MapSink(Sink):
         self._save()
         self._before += Counter(self.whole.counts)
         self.whole = self.whole.blank()
-        number = 1 + len(self._written) // max(1, len(self._files))
-        while any(_numbered(path, number).exists() for path, _ in self._first_files):
+        first, number = self._first_path, 1 + len(self._written)  # one that was written may be gone by now
+        while first is not None and _numbered(first, number).exists():
             number += 1
-        self._files = [(_numbered(path, number), save) for path, save in self._first_files]
+        self._path = None if first is None else _numbered(first, number)
 
     def _save(self) -> None:
-        """Take the presses that have not ended, and write the files of the map; nothing fused, no file."""
+        """Take the presses that have not ended, and write the file of the map; nothing fused, no file."""
         self.whole.finish()
-        for path, save in self._files if self.whole.fused else ():
-            if path in self._written:
-                continue
-            try:
-                check = check_npz if path.suffix == ".npz" else Path.stat
-                write_in_place(path, partial(save, whole=self.whole, **self._facts), check)
-            except (OSError, ValueError, KeyError) as error:
-                raise SinkError(f"cannot write {path}: {error}") from error
-            self._written.append(path)
+        path = self._path
+        if path is None or not self.whole.fused or path in self._written:
+            return
+        try:
+            write_in_place(path, partial(save_npz, whole=self.whole, **self._facts), check_npz)
+        except (OSError, ValueError, KeyError) as error:
+            raise SinkError(f"cannot write {path}: {error}") from error
+        self._written.append(path)
 
     def _show(self) -> None:
         if self.show is None or not self._unseen or self._clock_ns() < self._due_ns:
@@ -190,15 +185,6 @@ def _numbered(path: Path, number: int) -> Path:
 
 
 FORMAT: Final = "tactile-object-map"
-_GAP_PX: Final = 8
-_EMULATED: Final = (
-    "### #   # #  # #    ##  ### ### ## ",
-    "#   ## ## #  # #   #  #  #  #   # #",
-    "##  # # # #  # #   ####  #  ##  # #",
-    "#   #   # #  # #   #  #  #  #   # #",
-    "### #   #  ##  ### #  #  #  ### ## ",
-)
-"""Rows of a word that a picture of emulated data bears, since it may be shown without its name."""
 
 
 def save_npz(path: Path, whole: ObjectMap, **facts: str) -> None:
@@ -217,56 +203,3 @@ def check_npz(path: Path) -> None:
         shapes = {data[name].shape for name in MapLayers.__dataclass_fields__}
         if str(data["format"]) != FORMAT or len(shapes) != 1:
             raise ValueError(f"{path} is not a map")
-
-
-def save_png(path: Path, whole: ObjectMap, **facts: str) -> None:
-    """Write the contact layer as a picture, and beside it the height from its lowest part to the map's top.
-
-    White is not covered, or in the height not touched; red was covered by patterns alone that were not believed. Facts
-    are added as texts; where one is that the map is of an emulated sensor, a line above the picture states that.
-    """
-    layers = whole.layers()
-    heights_mm = layers.height_mm
-    lowest_mm = min(float(np.nanmin(heights_mm)), -1e-6) if np.isfinite(heights_mm).any() else -1.0
-    doubted = (layers.doubted > 0) & ~(layers.coverage > 0)
-    times = -(-480 // whole.grid.pixels)  # so that a layer's picture is at least 480 pixels wide
-    panels = [_coloured(layers.contact, doubted), _coloured(1 - heights_mm / lowest_mm, doubted)]
-    large = [np.repeat(np.repeat(panel, times, axis=0), times, axis=1) for panel in panels]
-    gap = np.full((len(large[0]), _GAP_PX, 3), 255, dtype=np.uint8)
-    picture = np.concatenate([large[0], gap, large[1]], axis=1)
-    if facts.get("origin") == "emulated":
-        picture = np.concatenate([_emulated_line(picture.shape[1]), picture])
-    path.write_bytes(png(picture, facts))
-
-
-def _emulated_line(width: int) -> NDArray[np.uint8]:
-    """Return a line (height, width, 3) with the word EMULATED, white on black."""
-    word = np.array([[mark == "#" for mark in row] for row in _EMULATED]).repeat(6, 0).repeat(6, 1)
-    line = np.zeros((len(word) + 2 * _GAP_PX, width, 3), dtype=np.uint8)
-    line[_GAP_PX:-_GAP_PX, _GAP_PX : _GAP_PX + word.shape[1]][word] = 255
-    return line
-
-
-def _coloured(shares: NDArray[np.floating], doubted: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    from edge.mapping.colours import colours  # not loaded by a run without a picture
-
-    covered = np.isfinite(shares)
-    pixels = colours(np.where(covered, shares, 0)).astype(np.uint8)
-    pixels[~covered] = 255
-    pixels[doubted] = (200, 40, 30)
-    return pixels
-
-
-def png(pixels: NDArray[np.uint8], facts: Mapping[str, str]) -> bytes:
-    """Return a PNG of pixels (H, W, 3), red, green and blue, with texts: so few chunks that no library is needed."""
-    height, width = pixels.shape[:2]
-    # Every line begins with its filter, 0 for none.
-    lines = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits a channel, true colour
-    texts = [(b"iTXt", f"{name}\0\0\0\0\0{text}".encode()) for name, text in facts.items()]
-    chunks = ((b"IHDR", header), *texts, (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, data) for kind, data in chunks)
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -2,20 +2,17 @@
 
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, unmapped, with_recorded
-from edge.terminal.progress_bar import progress
 from firmware_bridge.errors import BaselineRefusedError, as_typed
 from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED, free_stretch
@@ -28,7 +25,6 @@ def open_recording(
     zero: bool = False,
     paced: bool = False,
     rate_hz: float | None = None,
-    bar: bool = False,
     begins: threading.Event | None = None,
 ) -> Source:
     """Open a recording as a source, to compute its results again as `edge-sr replay` does.
@@ -42,7 +38,6 @@ def open_recording(
         zero: zero from the first 100 scans, instead of using the recorded baselines.
         paced: play at the recorded speed, as if live; a loop that is too slow loses scans, as with a sensor.
         rate_hz: scans a second of each sensor, where the file does not state it, or to play it at another speed.
-        bar: show on a terminal how much of it was taken.
         begins: set when a paced recording is to begin; at once without.
 
     Raises:
@@ -51,7 +46,7 @@ def open_recording(
         SensorFileError: the sensor file cannot be used.
     """
     paths = [path for file in (path, *more) for path in recording_paths(str(file))]
-    replay = (_FollowedReplay if bar else ReplayLink)(paths, rate_hz, paced=paced, begins=begins)
+    replay = ReplayLink(paths, rate_hz, paced=paced, begins=begins)
     tracks = [track for recording in replay.recordings for track in recording.tracks]
     # A sensor file names the pad; without one the recording's grid does.
     file = sensor_settings(sensor, unmapped(tracks[0].geometry) if sensor is None else None)
@@ -154,22 +149,3 @@ def _remedy(path: Path, rate_hz: float | None) -> str:
         f"edge-sr baseline --source replay:OTHER{rate} --out zero.json; edge-sr replay {as_typed(path)}{rate} "
         "--baseline zero.json shows patterns, marked as not to be believed"
     )
-
-
-class _FollowedReplay(ReplayLink):
-    """Recording with a bar that shows how much of it was taken."""
-
-    def __init__(self, paths: Sequence[str], rate_hz: float | None, **settings: Any) -> None:
-        super().__init__(paths, rate_hz, **settings)
-        scans = sum(len(track.counts) for recording in self.recordings for track in recording.tracks)
-        self._bar = progress("replay", scans, "scan")
-
-    def __exit__(self, *exc_info: object) -> None:
-        self._bar.close()
-        super().__exit__(*exc_info)
-
-    def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that fell due since the last call."""
-        scans = super().read(timeout_s)
-        self._bar.update(len(scans))
-        return scans

@@ -4,6 +4,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping
+from textwrap import shorten
 from typing import Final, TextIO
 
 from edge.perception.event import Event
@@ -32,7 +33,6 @@ class StatusSink(Sink):
         self._last_scan_s = clock_s()
         self._received_s: dict[str, float] = {}
         self._last_shown_s: float | None = None
-        self._without_poses: set[str | None] = set()
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Show one result, unless the line is fresh."""
@@ -40,13 +40,6 @@ class StatusSink(Sink):
         self._counters = counters
         self._last_scan_s = self._received_s[result.scan.sensor] = self._clock_s()
         self._refresh()
-
-    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Keep which sensors' poses have stopped."""
-        if event.kind == "poses_silent":
-            self._without_poses.add(event.sensor)
-        elif event.kind == "poses_back":
-            self._without_poses.discard(event.sensor)
 
     def wait(self) -> None:
         """Show the time without a scan."""
@@ -66,19 +59,11 @@ class StatusSink(Sink):
     def _show(self, end: str = "") -> None:
         # The last column stays free: some terminals wrap as soon as it is filled.
         try:
-            drawn(self._stream).write("\r" + self._fitted(shutil.get_terminal_size().columns - 1) + CLEAR_TO_END + end)
+            line = shorten(self.line(), max(shutil.get_terminal_size().columns - 1, 4), placeholder=" ...")
+            drawn(self._stream).write("\r" + line + CLEAR_TO_END + end)
             self._stream.flush()
         except OSError:
             self._terminal = False  # the window was closed; that ends no recording
-
-    def _fitted(self, columns: int) -> str:
-        """Return the line; on a narrow terminal a part that is too long is left out whole."""
-        line = self.line()
-        if len(line) <= columns:
-            return line
-        room = max(columns - len(" ..."), 0)
-        ends = [line.rfind(between, 0, room + len(between)) for between in (" | ", " ")]
-        return (line[: next((end for end in ends if end > 0), 0)] + " ...")[: max(columns, 0)]
 
     def line(self) -> str:
         """Return the line of what a person acts on, the most important part first."""
@@ -87,9 +72,6 @@ class StatusSink(Sink):
         if silence_s >= SHOWN_SILENT_S or not self._latest:
             parts.append(f"no scan for {silence_s:.0f} s")
         parts += [self._sensor_text(name) for name in sorted(self._latest)]
-        if self._without_poses:
-            of = ",".join(sorted(name or "" for name in self._without_poses))
-            parts.append(f"NO POSES {of}".rstrip())
         counted = ((name, self._counters.get(name, 0)) for name in _COUNTED)
         return " | ".join([*parts, *(f"{count} {name.replace('_', ' ')}" for name, count in counted if count)])
 

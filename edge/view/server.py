@@ -41,7 +41,7 @@ from firmware_bridge.links.base import SourceKind
 FOLDER: Final = Path(__file__).with_name("page")
 SCRIPTS: Final = (
     *("drawing.js", "numbers.js", "link.js", "traces.js"),
-    *("sensor.js", "hand.js", "map.js", "page.js"),
+    *("sensor.js", "map.js", "page.js"),
 )
 """Files of the script in the order in which they are joined, so that they share one scope."""
 

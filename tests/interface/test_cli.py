@@ -114,7 +114,6 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, "doctor --sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
         (5, f"{MAP} {{tmp}}/kept.npz", ["exists: give another name"]),
         (2, f"{MAP} {{tmp}}/m.mcap", ["ends in .npz"]),
-        (2, f"{MAP} {{tmp}}/m.npz --png {{tmp}}/m.jpg", ["ends in .png"]),
         (2, f"{MAP} {{tmp}}/m.npz --size-mm 9000", ["pixels along a side"]),
         (2, f"{MAP} {{tmp}}/m.npz --centre-mm 0 nan", ["finite numbers"]),
         (3, f"{KNOWN} --source slcan:/dev/none --sink jsonl:{{tmp}}/kept.jsonl", ["/dev/none", "no such port"]),

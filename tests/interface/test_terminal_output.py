@@ -15,11 +15,7 @@ from bridge_samples import make_counts, write_recording
 from edge_samples import write_model
 
 from edge.cli import main as cli
-from edge.terminal import progress_bar
 from edge.terminal.progress_bar import progress
-
-RATE = re.compile(r"scan/s|s/scan")
-"""Rate, as seconds per scan below one a second."""
 
 
 class Terminal:
@@ -46,21 +42,18 @@ class Terminal:
             self.stream.close()
 
 
-@pytest.mark.parametrize(("options", "shown"), [([], True), (["--sink", "status"], False), (["--paced"], False)])
+@pytest.mark.parametrize("options", [[], ["--sink", "status"], ["--paced"]])
 @pytest.mark.parametrize("to", ["-", "out.jsonl"])
-def test_a_replay_shows_one_for_the_live_line(tmp_path, monkeypatch, limits, capfd, terminal, options, shown, to):
+def test_a_replay_shows_the_live_line(tmp_path, monkeypatch, capfd, terminal, options, to):
     monkeypatch.chdir(tmp_path)
-    limits(progress_bar, DELAY_S=0)
     write_model(tmp_path / "tiny.onnx")
     path = write_recording(tmp_path / "finger.csv", make_counts(7), rate_hz=1000)
     with contextlib.redirect_stderr(terminal.stream):
         assert cli.main(["replay", str(path), "--model", "tiny.onnx", "--sink", f"jsonl:{to}", *options]) == 0
     written = capfd.readouterr().out if to == "-" else (tmp_path / to).read_text()
     assert written.count("\n") == 7
-    said = terminal.said()
-    assert bool(RATE.search(said) and re.search(r"\r +\r", said)) == shown
-    lives = "--sink" in options or ("--paced" in options and to != "-")  # records may go to the same terminal
-    assert ("REPLAY | " in said) == lives
+    lives = "--sink" in options or to != "-"  # else records may go to the same terminal
+    assert ("REPLAY | " in terminal.said()) == lives
 
 
 @pytest.fixture

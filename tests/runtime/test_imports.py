@@ -24,7 +24,7 @@ UNUSED_IN_A_REPLAY = {
         "tqdm",
         "edge.bench",
     ),
-    *("edge.cli.demo", "edge.mapping.colours", "cyclonedds", "tqdm", "websockets", "usb", "can", "subprocess"),
+    *("edge.cli.demo", "cyclonedds", "tqdm", "websockets", "usb", "can", "subprocess"),
     *("firmware_bridge.emulation.slcan_emulator", "firmware_bridge.links.demo"),
     *("firmware_bridge.links.slcan_serial", "firmware_bridge.links.xela_server"),
     *("firmware_bridge.links.gs_usb_link", "firmware_bridge.links.can_bus"),

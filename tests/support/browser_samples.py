@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from bridge_samples import write_npz
 from edge_samples import ROOT, wait_for
+from matplotlib import colormaps
 from packed_messages import unpack
 
 from edge.api import load_model
 from edge.inference.bundled import demo_recording
-from edge.mapping.colours import colours
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
@@ -245,11 +245,12 @@ def colours_of(pixels):
 
 
 def shares(pixels):
-    """Return the shares of the scale of a canvas's colours, by the terminal's own table of the same colours."""
+    """Return the shares of the scale of a canvas's colours."""
     rgba = colours_of(pixels)
     assert (rgba[..., 3] == 255).all()
     steps = np.linspace(0, 1, 256)
-    return steps[np.abs(rgba[..., None, :3] - colours(steps)).sum(axis=-1).argmin(axis=-1)]
+    colours = 255 * colormaps["viridis"](steps)[:, :3]
+    return steps[np.abs(rgba[..., None, :3] - colours).sum(axis=-1).argmin(axis=-1)]
 
 
 def likeness(shown, truth):

@@ -139,10 +139,7 @@ GOODBYE = b"\x88\x80\x00\x00\x00\x00"
 CLIENTS = {
     "connect": b"",
     "get": b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n",
-    "post": b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\n\r\n{}",
     "garbage": b"\x16\x03\x01\x02\x00\r\n\r\n",
-    "stranger": HANDSHAKE.replace(b"localhost", b"stranger"),
-    "version": HANDSHAKE.replace(b"13", b"12"),
     "viewer": HANDSHAKE,
 }
 

@@ -185,7 +185,6 @@ function sensorOf(name) {
     const next = [...byId("sensors").children].find((root) => later.some((other) => other.root === root));
     byId("sensors").insertBefore(sensor.root, next ?? null);
     page.sensors.set(name, sensor);
-    hand.arrange();
     painter.all();
   }
   return page.sensors.get(name);
@@ -195,7 +194,6 @@ function sensorOf(name) {
 function forgetRun() {
   for (const sensor of page.sensors.values()) sensor.remove();
   page.sensors.clear();
-  hand.arrange();
   page.map.forget();
   page.eventNumber = 0;
   forgetRefusal();
@@ -224,9 +222,6 @@ const act = {
     page.shear = !page.shear;
     painter.all();
   },
-  before() { hand.step(-1); },
-  after() { hand.step(1); },
-  close() { hand.open(null); },
   span() {
     page.spanS = page.spanS === 10 ? 60 : 10;
     painter.all();
@@ -234,7 +229,7 @@ const act = {
   help() { if (!byId("manual").open) byId("manual").showModal(); },
 };
 
-const KEYS = { z: "zero", "shift z": "force", r: "reset", t: "span", "?": "help", "[": "before", "]": "after", escape: "close" };
+const KEYS = { z: "zero", "shift z": "force", r: "reset", t: "span", "?": "help" };
 
 function pressed(event) {
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat || document.querySelector("dialog[open]")) return;

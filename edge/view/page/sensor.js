@@ -168,11 +168,6 @@ class Sensor {
 
   paint() {
     this.dirty = false;
-    hand.paint(this);
-    if (hand.shows(this)) this.paintWhole();
-  }
-
-  paintWhole() {
     this.paintWord();
     this.paintPattern();
     this.paintTaxels();
@@ -200,11 +195,8 @@ class Sensor {
     this.paintLink();
   }
 
-  /** Return whether scans come from this sensor now: not only that the page is connected. */
-  comes() { return page.link.up && this.result !== null && !this.away(); }
-
   paintLink() {
-    const up = this.comes();
+    const up = page.link.up && this.result !== null && !this.away();
     this.part.link.dataset.up = up ? "yes" : "no";
     const rate = this.result?.rate_hz;
     const away = this.silentS === null ? "no scan" : `no scan for ${duration(this.silentS)}`;
