@@ -365,3 +365,14 @@ def test_gains_of_a_mounting_are_not_left_out_unseen(turned, tmp_path):
     gained = messages_alone(turned, tmp_path / "gained.mcap", ("/s4/scan",), metadata=records)
     with pytest.raises(RecordingError, match="no mounting of sensor '4': it has gains, which this release does not"):
         load_recording(gained)
+
+
+def test_a_baseline_of_an_undated_recording_has_no_age_in_a_run_of_today(tmp_path):
+    sink = McapSink(tmp_path / "undated.mcap", SURE, fake_source(unix_offset_ns=0))
+    for result in make_results([make_scan(number, time_ns=(number + 1) * PERIOD_NS) for number in range(3)]):
+        sink.write(result, {})
+    sink.close()
+    for paced in (True, False):
+        source = open_recording(tmp_path / "undated.mcap", paced=paced)
+        baseline = source.sensor_file.baselines["4"]
+        assert (baseline.id, np.isnan(baseline.created_unix_s)) == (BASELINE.id, paced)
