@@ -367,7 +367,7 @@ def test_gains_of_a_mounting_are_not_left_out_unseen(turned, tmp_path):
         load_recording(gained)
 
 
-def test_a_baseline_of_an_undated_recording_has_no_age_in_a_run_of_today(tmp_path):
+def test_a_baseline_of_an_undated_recording_has_no_age_today(tmp_path):
     sink = McapSink(tmp_path / "undated.mcap", SURE, fake_source(unix_offset_ns=0))
     for result in make_results([make_scan(number, time_ns=(number + 1) * PERIOD_NS) for number in range(3)]):
         sink.write(result, {})

@@ -133,7 +133,7 @@ def test_a_value_that_cannot_be_is_refused_by_its_key(tmp_path, key, value, expe
     assert one_line(refused)
 
 
-def test_factors_of_one_are_read_which_doctor_wrote_into_every_file_of_before(tmp_path):
+def test_factors_of_one_as_in_every_file_of_before_are_read(tmp_path):
     (tmp_path / "s.toml").write_text(text_of(signs="[1, -1, 1]\ngains = [1.0, 1.0, 1.0]", id=""))
     assert load_sensor_file(tmp_path / "s.toml").mountings["4"].signs == (1, -1, 1)
 

@@ -37,7 +37,7 @@ class TestResult:
         assert result.note == "not checked: the model has no checks"
         assert result.deviation is result.interval_mm is None, "the model gives none"
 
-    def test_a_window_is_the_newest_scan_and_then_the_earlier_peaks_newest_first(self):
+    def test_a_window_is_the_newest_scan_then_peaks_newest_first(self):
         model = FakeModel()
         pad = Pushed(make_runtime(model))
         for press, made_of in ((8000, [8, 0, 0, 0]), (6000, [6, 8, 0, 0]), (4000, [4, 6, 8, 0])):
