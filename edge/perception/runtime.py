@@ -152,7 +152,7 @@ class Sensor:
                 due.tap, newest, made.pattern, about[0] if about else None, made.traction, self._health.most_repeats
             )
         self._describe(made, due.tap, newest, about)
-        self._taps.see(due.tap, step.force_counts or 0.0, None if made.trusted is False else step.pose)
+        self._taps.see(due.tap, step.force_counts or 0.0, None if made.trusted is False else step.pose, made.taps_used)
         if self.learn is not None:
             self.learn(step, made, due.counts[0])
 

@@ -192,10 +192,10 @@ class Taps:
                 rows = scheduled_rows(1, 0.0) if self._takes_poses else None
                 step.due = Window(counts, 1, (0,), rows, NO_TAP, (NO_TAP, step.filled))
 
-    def see(self, tap: int, z_counts: float, pose: PadPose | None) -> None:
+    def see(self, tap: int, z_counts: float, pose: PadPose | None, taps_used: int) -> None:
         """Take a pattern's tap and pose, None if it is not believed: the strongest one tells where the tap was."""
         if tap != self._strongest[0] or z_counts >= self._strongest[1]:
-            self._strongest = tap, z_counts, pose
+            self._strongest = tap, z_counts, pose if taps_used < self._most else None
 
     def _window(self, step: Step, tap: TapTracker, *, scheduled: bool) -> Window:
         if self._takes_poses:
@@ -250,9 +250,9 @@ class Taps:
             self._report(kind, why)
 
     def _propose(self, peaks: tuple[TapPeak, ...]) -> NextTap | None:
-        """Return where to touch next, the same for the same taps; None without a pose, or after a doubtful tap."""
+        """Return where to touch next, the same for the same taps; None where no tap is to follow the newest."""
         tap, _, newest = self._strongest
-        if newest is None or tap != peaks[0].tap or len(peaks) >= self._most:
+        if newest is None or tap != peaks[0].tap:
             return None
         if peaks is not self._proposed[0]:
             seen = [

@@ -53,7 +53,9 @@ def open_recording(
     stored = with_recorded(file, [replay])
     baselines: dict[str, Baseline] = {}
     for recording in () if zero else replay.recordings:
-        baselines |= recording.baselines
+        # By the clock of an undated recording, they would be half a century old in a run of today.
+        undated = {"created_unix_s": math.nan} if paced and not recording.unix_offset_ns else {}
+        baselines |= {name: replace(baseline, **undated) for name, baseline in recording.baselines.items()}
     if not zero:
         baselines = baselines or stored.baselines
         baselines |= free_baselines(replay, stored.mountings, baselines, rate_hz=rate_hz)
@@ -135,7 +137,7 @@ def free_baselines(
             if raw and name in mountings:
                 stretch = stretch._replace(counts=mountings[name].place_counts(stretch.counts))
             created_s = math.nan
-            if recording.unix_offset_ns is not None and track.time_ns is not None:
+            if recording.unix_offset_ns and track.time_ns is not None:  # 0: recorded again from an undated file
                 created_s = (int(track.time_ns[last]) + recording.unix_offset_ns) / 1e9
             baselines[name] = stretch.baseline(name, created_s)
     return baselines

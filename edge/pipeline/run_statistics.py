@@ -13,7 +13,7 @@ from edge.perception.result import Result
 from firmware_bridge.errors import as_typed
 
 NEWEST: Final = 10_000  # patterns whose times are kept, a hundred seconds of one sensor
-ANSWERS_BYTES: Final = 64  # fewer are the adapter's answers to commands
+MOST_STRAY_BYTES: Final = 64  # more bytes of no line of an adapter's are another device's
 STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
 COUNTED: Final = (
@@ -179,7 +179,7 @@ def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int
         return f"{arrived['frames']} CAN frames came, and {lack}; {doctor}"
     if errors := arrived["error_frames"] + arrived["fd_frames"]:
         return f"{errors} error frames or frames of CAN FD came, and no reading: is the bus at 1 Mbit/s? {doctor}"
-    if received >= ANSWERS_BYTES:
+    if arrived["skipped_bytes"] > MOST_STRAY_BYTES:
         return (
             f"{received} bytes came, and no CAN frame in them: another device, or another line speed (@BAUD after the "
             f"port)? edge-sr devices lists what is plugged in, and {doctor}"

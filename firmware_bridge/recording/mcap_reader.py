@@ -82,7 +82,9 @@ def load_mcap(path: Path) -> Recording:
     with path.open("rb") as file:
         try:
             for record in messages(file, reading.topic_of):
-                if not isinstance(record, Metadata):
+                if isinstance(record, Metadata):
+                    reading.take_metadata(record.name, record.metadata)
+                else:
                     reading.take_message(*record)
         except CutOffError as end:
             reading.notes.insert(0, f"{path} breaks off ({end}): its recording was killed, or the disk was full")
@@ -117,7 +119,7 @@ class _Reading:
         scanned = {name: entry for name, entry in self._sensors.items() if entry.times_ns}
         if not scanned:
             self._refuse("; ".join(["no scans that edge-sr recorded", *self.notes]))
-        bare = sorted(name for name, entry in scanned.items() if entry.facts is None)
+        bare = sorted(name for name, entry in scanned.items() if entry.facts is None and entry.mounting is None)
         if bare:
             self.notes.append(
                 f"{self._path}: the mounting of sensor {', '.join(bare)} is not in the file, as after a tool that "
@@ -155,6 +157,17 @@ class _Reading:
         self._sized = self._sized or schema.name in (SCAN_NAME, BASELINE_NAME)
         return wanted
 
+    def take_metadata(self, name: str, fields: Mapping[str, str]) -> None:
+        """Take the mounting of a sensor and the kind of source, which the first release recorded as metadata alone."""
+        if name == "mounting":
+            sensor = fields.get("sensor", "")
+            self._take_mounting(sensor, self._sensor(sensor), fields.get("mounting", ""))
+        elif name == "source":
+            self._take_source(fields)
+
+    def _take_source(self, fields: Mapping[str, str]) -> None:
+        self._origin = origin_of({fields.get("kind", ""), self._origin or ""} - {""})
+
     def _take_geometry(self, fields: Mapping[str, str]) -> None:
         try:
             geometry = SensorGeometry(**{key: json.loads(text) for key, text in fields.items()})
@@ -190,7 +203,7 @@ class _Reading:
                 for name, values in json.loads(text).items()
             }
             if "source" in facts:
-                self._origin = origin_of({facts["source"].get("kind", ""), self._origin or ""} - {""})
+                self._take_source(facts["source"])
             if "geometry" in facts:
                 self._take_geometry(facts["geometry"])
             if "mounting" in facts:

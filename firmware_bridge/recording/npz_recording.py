@@ -112,6 +112,8 @@ _SCANS: Final = {"sensor": "U", "time_ns": "iu", "counts": "iu", "origin": "U"}
 _POSES: Final = {"pose_time_ns": "iu", "pose": "fiu", "pose_sensor": "U", "pose_holds": "b"}
 """Arrays with a row for each scan, the last for each pose, and their kinds of numpy."""
 _REQUIRED: Final = ("format", "version", "sensor", "time_ns", "counts")
+_CONVERTED: Final = ("baseline_counts", "mountings", "source")
+"""Arrays by which files that earlier releases wrote are known: readings would be wrong without what they hold."""
 _KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "fiu": "numbers"}
 
 
@@ -124,10 +126,12 @@ def load_npz(path: Path) -> Recording:
 
 
 def _recording(path: Path) -> Recording:
-    arrays = read_npz(path, (*_REQUIRED, *_SCANS, *_POSES), MOST_NPZ_BYTES)
+    arrays = read_npz(path, (*_REQUIRED, *_SCANS, *_POSES, *_CONVERTED), MOST_NPZ_BYTES)
     if str(arrays.get("format", "missing")) != NPZ_FORMAT:
         got = repr(str(arrays.get("format", "missing"))[:40])
         _refuse("format", got, f"'{NPZ_FORMAT}'; of a converted file play the .mcap")
+    for name in [name for name in _CONVERTED if name in arrays]:
+        _refuse(name, "a file of an earlier release", "none: play its .mcap, or convert it to one with that release")
     for name in _REQUIRED:
         if name not in arrays:
             raise NpzError(f"array '{name}': missing, expected it beside {', '.join(_REQUIRED)}")

@@ -212,6 +212,8 @@ def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
         "order": cells(grid, lambda all_: set(map(type, all_)) == {int} and sorted(all_) == taxels, places),
         "swap_xy": truth,
         "signs": cells((len(AXES),), _are_signs, "1 or -1 for each of x, y, z"),
+        # Files of before state it without a need: other gains are those of the pad.
+        "gains": cells((len(AXES),), lambda all_: all_ == [1, 1, 1], "no factors: take the line out"),
         "counts_per_newton": between(*PAD_RANGES["counts_per_newton"]),
         "counts_per_newton_interval": partial(_interval, *PAD_RANGES["counts_per_newton"]),
         **dict.fromkeys(("assumed", "emulated"), _marks),
@@ -219,7 +221,7 @@ def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
     }
     taken = {key: table.take(key, read, required=False) for key, read in readers.items()}
     table.end()
-    values = {key: value for key, value in taken.items() if value is not None}
+    values = {key: value for key, value in taken.items() if value is not None and key != "gains"}
     _check_around(table, "counts_per_newton", values, values.get("counts_per_newton_interval"))
     mounting = {key: values.pop(key) for key in ("order", "swap_xy", "signs") if key in values}
     for key, read in parts.items():

@@ -4,8 +4,9 @@ import fcntl
 import json
 import math
 import os
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +27,7 @@ from firmware_bridge.sensor_file.model import (
 )
 
 _EMULATED: Final = "measured on an emulated sensor: not for a device"
+LOCKED_S: Final = 5.0  # longest wait for another program that changes the file, in [s]: changing it takes milliseconds
 
 
 @contextmanager
@@ -34,6 +36,9 @@ def changing(path: str | Path) -> Iterator[None]:
 
     The lock is on the folder, since the file is replaced by a new one each time, and goes with the program. Where a
     file system has no locks, none is taken.
+
+    Raises:
+        SensorFileError: another program holds the lock for too long.
     """
     try:
         folder = os.open(Path(path).parent, os.O_RDONLY)
@@ -41,8 +46,17 @@ def changing(path: str | Path) -> Iterator[None]:
         yield
         return
     try:
-        with suppress(OSError):
-            fcntl.flock(folder, fcntl.LOCK_EX)
+        end_s = time.monotonic() + LOCKED_S
+        while True:
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() >= end_s:
+                    raise SensorFileError(f"{path}: another program has kept it locked for {LOCKED_S:g} s") from error
+                time.sleep(0.01)
+            except OSError:
+                break
         yield
     finally:
         os.close(folder)

@@ -41,6 +41,7 @@ from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import SENSOR, decode_baseline, decode_scan
+from firmware_bridge.recording.tracks import mounting_text
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import PadFrame, SensorEntry, SensorFile
@@ -355,3 +356,34 @@ def test_recordings_of_before_stay_readable(tmp_path):
     texts = {schema.name.rpartition("/")[2]: hashlib.sha256(schema.data).hexdigest()[:12] for schema in schemas}
     recorded = {"Scan": "6a35e40d3860", "Baseline": "e3ede75454cb", "Sensor": "54829f0a30b8"}
     assert recorded.items() <= texts.items()
+
+
+def metadata_alone(path, to):
+    """Copy a recording as the first release made it: what is known of its sensors in metadata, not in messages."""
+    records = {"mounting": {"sensor": "4", "mounting": mounting_text(TURNED)}, "source": {"kind": "emulated"}}
+    return messages_alone(path, to, ("/s4/scan", "/s4/baseline"), metadata=records)
+
+
+def test_the_mounting_and_the_origin_in_metadata_are_read(turned, tmp_path):
+    recording = load_recording(metadata_alone(turned, tmp_path / "first.mcap"))
+    assert (recording.origin, dict(recording.mountings)) == ("emulated", {"4": TURNED})
+    assert not any("is not in the file" in note for note in recording.notes)
+
+
+def test_gains_of_a_mounting_are_not_left_out_unseen(turned, tmp_path):
+    fields = json.loads(mounting_text(TURNED)) | {"gains": [1.0] * 47 + [0.9]}
+    records = {"mounting": {"sensor": "4", "mounting": json.dumps(fields)}}
+    gained = messages_alone(turned, tmp_path / "gained.mcap", ("/s4/scan",), metadata=records)
+    with pytest.raises(RecordingError, match="no mounting of sensor '4': it has gains, which this release does not"):
+        load_recording(gained)
+
+
+def test_a_baseline_of_an_undated_recording_has_no_age_today(tmp_path):
+    sink = McapSink(tmp_path / "undated.mcap", SURE, fake_source(unix_offset_ns=0))
+    for result in make_results([make_scan(number, time_ns=(number + 1) * PERIOD_NS) for number in range(3)]):
+        sink.write(result, {})
+    sink.close()
+    for paced in (True, False):
+        source = open_recording(tmp_path / "undated.mcap", paced=paced)
+        baseline = source.sensor_file.baselines["4"]
+        assert (baseline.id, np.isnan(baseline.created_unix_s)) == (BASELINE.id, paced)

@@ -264,6 +264,7 @@ OF_65 = {"sensor": np.arange(65).astype(str), "counts": np.zeros((65, 3, 4, 4), 
     ("words", "changes"),
     [
         ("array 'format': 'tactile-results', .* play the .mcap", {"format": "tactile-results"}),
+        ("array 'mountings': a file of an earlier release", {"mountings": "{}"}),
         ("array 'version': 2, expected 1", {"version": 2}),
         ("array 'counts': missing", {"counts": None}),
         *(

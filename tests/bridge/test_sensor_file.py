@@ -133,6 +133,11 @@ def test_a_value_that_cannot_be_is_refused_by_its_key(tmp_path, key, value, expe
     assert one_line(refused)
 
 
+def test_factors_of_one_as_in_every_file_of_before_are_read(tmp_path):
+    (tmp_path / "s.toml").write_text(text_of(signs="[1, -1, 1]\ngains = [1.0, 1.0, 1.0]", id=""))
+    assert load_sensor_file(tmp_path / "s.toml").mountings["4"].signs == (1, -1, 1)
+
+
 HEAD = 'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n'
 PAD = f"{HEAD}[sensors.4.pad]\n"
 FRAME = f"{HEAD}[sensors.4]\n[sensors.4.frame]\n"
@@ -145,6 +150,10 @@ OF_GAINS, PLACE = f"gains = {[1.0] * 48}\n", "place_mm = [0, 0, 0]\n"
         (text_of() + "colour = 1\n", "'sensors.4.baseline.colour': not known, expected one of id, created_unix_s"),
         (text_of(swap_xy="false\nswap = true"), "'sensors.4.swap': not known"),
         ("offset = 1\n" + text_of(), "'offset': not known"),
+        (
+            text_of(signs="[1, 1, 1]\ngains = [1.0, 1.0, 0.9]"),
+            "'sensors.4.gains': [1.0, 1.0, 0.9], expected no factors",
+        ),
         (HEAD, "'sensors': missing"),
         (HEAD + '[sensors."4\\n"]\n', "names of 1 to 64 printable characters"),
         ("format = ", "not TOML"),

@@ -177,7 +177,7 @@ def test_what_is_wrong_is_read_from_what_came(said):
     ("counters", "words"),
     [
         ({"messages": 5}, "no whole scan in them"),
-        ({"received_bytes": 12, "replies": 4}, "12 bytes came, the adapter's answers alone: is the sensor powered"),
+        ({"received_bytes": 240, "status_answers": 60}, "240 bytes came, the adapter's answers alone: is the sensor"),
         ({"frames": 0, "error_frames": 7}, "7 error frames .* 1 Mbit/s"),
         ({"frames": 90, "foreign": 90}, "90 CAN frames came, and no whole scan .*--id-map"),
     ],

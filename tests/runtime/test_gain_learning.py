@@ -1,5 +1,7 @@
 """Gains that a running sensor learns from its contacts: bounded, robust, kept, and forgotten on demand."""
 
+import fcntl
+import os
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -265,6 +267,13 @@ class TestKeeping:
             forget_learned(file, "4")
         assert cli.main(["doctor", "--forget-gains", "4"]) == 2
         assert "add --sensor FILE" in capsys.readouterr().err
+
+    def test_a_lock_that_another_program_never_gives_back_is_told(self, file, capsys):
+        other = os.open(file.parent, os.O_RDONLY)
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert cli.main(["doctor", "--sensor", str(file), "--forget-gains", "4"]) == 2
+        assert f"{file}: another program has kept it locked for 5 s" in capsys.readouterr().err
+        os.close(other)
 
     @pytest.mark.parametrize("kind", ["device", "emulated", "replay", "file gone", "turned by hand"])
     def test_a_stream_keeps_what_its_runtime_learns_of_a_device(self, file, kind):

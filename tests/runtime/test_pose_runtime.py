@@ -230,7 +230,7 @@ def test_an_earlier_tap_is_not_touched_again_and_in_reach():
 
 
 def test_a_robot_that_follows_touches_no_place_twice():
-    pad, places = make_pad(SURE, idle_reset_s=0.2), set()
+    pad, places = make_pad(make_posed_contract(interval_factor=1.6, taps=5), idle_reset_s=0.2), set()
     pose = begun = PadPose(5, -3, 30)
     for _ in range(4):
         assert pad.tap(pose).next_tap is None
@@ -241,6 +241,8 @@ def test_a_robot_that_follows_touches_no_place_twice():
         assert (seen.x_mm, seen.y_mm, seen.turn_deg) == pytest.approx((proposed.dx_mm, proposed.dy_mm, 0), abs=1e-9)
         pose = proposed.target
     assert len(places) == 4 and all(x == round(x) and y == round(y) for x, y in places)
+    pad.tap(pose)
+    assert pad.results[-1].next_tap is None, "the model takes no further tap: a robot that follows stops"
 
 
 def test_it_stays_until_the_next_tap_or_an_idle_time():

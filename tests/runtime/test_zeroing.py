@@ -92,6 +92,12 @@ class TestCapture:
             take_baselines(source, clock_s=source.now_s)
         assert source.taken < 200
 
+    def test_a_stop_ends_it_and_nothing_is_kept(self):
+        stop = threading.Event()
+        stop.set()
+        with pytest.raises(BaselineRefusedError, match="stopped before every sensor was zeroed: nothing is kept"):
+            take(FakeLink(rest_scans(5), endless=True), stop=stop)
+
     def test_a_sensor_that_is_done_may_move_while_another_is_not(self):
         scans = [
             [

@@ -1,8 +1,10 @@
 """Helpers for tests of MCAP recordings: a recording, and reading one with the public package."""
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
@@ -80,17 +82,20 @@ def same_scan(got: Scan, scan: Scan) -> bool:
 def messages_alone(
     path: Path,
     to: Path,
-    topics: str | None = None,
+    topics: str | tuple[str, ...] | None = None,
     start_ns: int | None = None,
     more: Path | None = None,
+    metadata: Mapping[str, dict[str, str]] = MappingProxyType({}),
 ) -> Path:
-    """Copy messages of these topics and times (all by default), as tools do: without metadata and attachments.
+    """Copy messages of these topics and times (all by default), as tools do: without attachments, with other metadata.
 
     Those of `more`, another recording, follow.
     """
     with to.open("wb") as target:
         writer = Writer(target)
         writer.start()
+        for name, fields in metadata.items():
+            writer.add_metadata(name, fields)
         for one in filter(None, (path, more)):
             channels: dict[int, int] = {}
             with one.open("rb") as source:
