@@ -160,6 +160,7 @@ OF_GAINS, PLACE = f"gains = {[1.0] * 48}\n", "place_mm = [0, 0, 0]\n"
         (PAD + "gains = [1, 1, 1]", "48 numbers from 0.01 to 100: x of all places, then y, then z"),
         (PAD + f"gain_half_widths = {[0.1] * 48}", "'sensors.4.pad.gain_half_widths': without gains, expected both"),
         (PAD + OF_GAINS + f"gain_half_widths = {[1.5] * 48}", "48 numbers from 0 to 1"),
+        (f"{HEAD}[sensors.4]\ngains = [1, 1, 1.1]", "'sensors.4.gains': [1, 1, 1.1], expected 1 for each, or none"),
         (FRAME + 'parent = "tool0"\nplace_mm = [0, 0, 1e6]', "expected three numbers up to 100000"),
         (FRAME + PLACE + 'parent = "/tool0"', "parent is '/tool0', expected the name of a frame"),
         (FRAME + PLACE, "'sensors.4.frame.parent': missing"),
@@ -173,6 +174,12 @@ def test_what_is_no_sensor_file_is_refused(tmp_path, text, words):
     with pytest.raises(SensorFileError, match=re.escape(words)) as refused:
         load_sensor_file(path)
     assert one_line(refused)
+
+
+def test_a_file_of_an_earlier_release_is_read(tmp_path):
+    for gains in ([1.0] * 3, [[[1.0] * 4] * 4] * 3):  # which its doctor wrote into each
+        (tmp_path / "s.toml").write_text(f"{HEAD}[sensors.4]\nswap_xy = true\ngains = {gains}\n")
+        assert load_sensor_file(tmp_path / "s.toml").mountings["4"].swap_xy
 
 
 def test_a_short_file_by_hand_is_enough(tmp_path):
