@@ -111,6 +111,8 @@ MOST_NPZ_BYTES: Final = 1 << 31  # most bytes of the arrays that are read: a day
 _SCANS: Final = {"sensor": "U", "time_ns": "iu", "counts": "iu", "origin": "U"}
 _POSES: Final = {"pose_time_ns": "iu", "pose": "fiu", "pose_sensor": "U", "pose_holds": "b"}
 """Arrays with a row for each scan, the last for each pose, and their kinds of numpy."""
+_CONVERTED: Final = ("mountings", "source")
+"""Arrays that earlier releases added to counts: without them axes would be others, and emulated scans a device's."""
 _REQUIRED: Final = ("format", "version", "sensor", "time_ns", "counts")
 _KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "fiu": "numbers"}
 
@@ -124,13 +126,15 @@ def load_npz(path: Path) -> Recording:
 
 
 def _recording(path: Path) -> Recording:
-    arrays = read_npz(path, (*_REQUIRED, *_SCANS, *_POSES), MOST_NPZ_BYTES)
+    arrays = read_npz(path, (*_REQUIRED, *_SCANS, *_POSES, *_CONVERTED), MOST_NPZ_BYTES)
     if str(arrays.get("format", "missing")) != NPZ_FORMAT:
         got = repr(str(arrays.get("format", "missing"))[:40])
         _refuse("format", got, f"'{NPZ_FORMAT}'; of a converted file play the .mcap")
     for name in _REQUIRED:
         if name not in arrays:
             raise NpzError(f"array '{name}': missing, expected it beside {', '.join(_REQUIRED)}")
+    for name in filter(arrays.__contains__, _CONVERTED):
+        _refuse(name, "of an earlier release", "none, since it would not be heeded: play the .mcap of this file")
     version, counts = arrays["version"], arrays["counts"]
     if version.shape or version.dtype.kind not in "iu" or int(version) != NPZ_VERSION:
         _refuse("version", str(version)[:40], f"{NPZ_VERSION}")

@@ -134,6 +134,8 @@ def read_mounting(text: str, taxel_count: int) -> Mounting:
         order, signs = tuple(fields["order"]), tuple(fields["signs"])
         if not all(type(value) is int for value in (*order, *signs)) or type(fields["swap_xy"]) is not bool:
             raise ValueError("not whole numbers")
+        if any(gain != 1 for gain in fields.get("gains", ())):  # of earlier releases
+            raise ValueError("gains other than 1: play it with the release that recorded it")
         return Mounting(order, fields["swap_xy"], signs, taxel_count)
     except (TypeError, KeyError, RecursionError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from error

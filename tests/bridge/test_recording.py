@@ -264,6 +264,8 @@ OF_65 = {"sensor": np.arange(65).astype(str), "counts": np.zeros((65, 3, 4, 4), 
     ("words", "changes"),
     [
         ("array 'format': 'tactile-results', .* play the .mcap", {"format": "tactile-results"}),
+        ("array 'mountings': of an earlier release, .* play the .mcap", {"mountings": "{}"}),
+        ("array 'source': of an earlier release, .* play the .mcap", {"source": ["emulated"] * 4}),
         ("array 'version': 2, expected 1", {"version": 2}),
         ("array 'counts': missing", {"counts": None}),
         *(
