@@ -72,13 +72,13 @@ class StatusSink(Sink):
             self._terminal = False  # the window was closed; that ends no recording
 
     def _fitted(self, columns: int) -> str:
-        """Return the line; on a narrow terminal a part that is too long is left out whole."""
+        """Return the line, cut on a narrow terminal between two parts, or between words where that would cut half."""
         line = self.line()
         if len(line) <= columns:
             return line
         room = max(columns - len(" ..."), 0)
         ends = [line.rfind(between, 0, room + len(between)) for between in (" | ", " ")]
-        return (line[: next((end for end in ends if end > 0), 0)] + " ...")[: max(columns, 0)]
+        return (line[: next((end for end in ends if end > room // 2), max(*ends, 0))] + " ...")[: max(columns, 0)]
 
     def line(self) -> str:
         """Return the line of what a person acts on, the most important part first."""

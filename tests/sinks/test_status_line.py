@@ -84,6 +84,7 @@ class TestStatus:
                 " | 6 no stored baseline for sensor 6, only for 4: zeroing | 2 dropped | 1 overruns | 3 torn wire",
             ),
             (60, "EMULATED | 4 contact not checked 3007 counts 22 mm2 ..."),
+            (40, "EMULATED | 4 contact not checked ..."),
             (20, "EMULATED ..."),
             (10, " ..."),
             (4, " .."),
