@@ -295,6 +295,7 @@ def test_files_that_cannot_be_read(tmp_path):
         ("gone.csv", None, r"gone\.csv: cannot be read: No such file"),
         ("folder.csv", None, r"folder\.csv is a folder, expected a recording: it holds no \.mcap"),
         ("finger.txt", b"", r"ends in \.csv, \.npz or \.mcap"),
+        ("finger.csv", b"", "line 1: an empty file, expected a header and a row of counts"),
         ("finger.csv", HEADER.encode(), r"finger\.csv, .*expected a row of counts"),
         ("finger.npz", whole[:-1], "not a whole .npz archive"),
         ("finger.npz", whole[:600] + bytes([whole[600] ^ 0xFF]) + whole[601:], "finger"),
