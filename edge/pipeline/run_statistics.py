@@ -166,6 +166,15 @@ class Statistics:
         return lines
 
 
+_UNREAD: Final = {
+    "without_readings": "they name no sensor: is one plugged in, and in the server's xServ.ini?",
+    "welcomes": "the server only greets: is a sensor plugged in, and in its xServ.ini?",
+    "bad_sensor": "the counts of their sensors are not those of a pad",
+    "bad_json": "they are no JSON with a number: another server answers at this address",
+}
+"""Why messages of a server give no reading, by their counters, which the doctor does not show."""
+
+
 def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int]]) -> str:
     """Return what came of the sources, as the user named them, what may be wrong, and what to do."""
     source = f" --source {as_typed(sources[0])}" if len(sources) == 1 else ""
@@ -173,7 +182,9 @@ def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int
     arrived = Counter(counters())
     received = arrived["received_bytes"]
     if arrived["messages"]:
-        return f"{arrived['messages']} messages came from the server, and no whole scan in them; {doctor}"
+        why = max(_UNREAD, key=arrived.__getitem__)
+        lack = f": {_UNREAD[why]}" if arrived[why] else f"; {doctor}"
+        return f"{arrived['messages']} messages came from the server, and no whole scan in them{lack}"
     if arrived["frames"]:
         lack = "no whole scan in them: frames are lost, or this is another kind of pad (--id-map)"
         return f"{arrived['frames']} CAN frames came, and {lack}; {doctor}"

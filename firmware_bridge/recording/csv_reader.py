@@ -134,7 +134,9 @@ def load_csv(path: Path) -> Recording:
         raise RecordingError(f"{path}, line {row.line if row else 1}: {error}") from error
     if scans is None or not scans.count:
         empty = (
-            "line 1: an empty file, expected a header" if scans is None else "after its first line: no row, expected"
+            "line 1: an empty file, expected a header and"
+            if scans is None
+            else "after its first line: no row, expected"
         )
         raise RecordingError(f"{path}, {damaged or empty + ' a row of counts'}")
     notes = []

@@ -25,6 +25,7 @@ from firmware_bridge.strict_table import (
     is_number,
     numbers,
     one_of,
+    reader,
     text_value,
     truth,
     whole,
@@ -212,12 +213,11 @@ def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
         "order": cells(grid, lambda all_: set(map(type, all_)) == {int} and sorted(all_) == taxels, places),
         "swap_xy": truth,
         "signs": cells((len(AXES),), _are_signs, "1 or -1 for each of x, y, z"),
-        # Files of before state it without a need: other gains are those of the pad.
-        "gains": cells((len(AXES),), lambda all_: all_ == [1, 1, 1], "no factors: take the line out"),
         "counts_per_newton": between(*PAD_RANGES["counts_per_newton"]),
         "counts_per_newton_interval": partial(_interval, *PAD_RANGES["counts_per_newton"]),
         **dict.fromkeys(("assumed", "emulated"), _marks),
         **dict.fromkeys(parts, a_table),
+        "gains": reader(_are_ones, "1 for each, or none: how strongly each place reads is [sensors.NAME.pad] gains"),
     }
     taken = {key: table.take(key, read, required=False) for key, read in readers.items()}
     table.end()
@@ -297,6 +297,11 @@ def _marks(value: Any) -> frozenset[str]:
 
 def _are_signs(signs: list[Any]) -> bool:
     return all(type(sign) is int and sign in (1, -1) for sign in signs)
+
+
+def _are_ones(value: Any) -> bool:
+    """Return whether lists hold nothing but 1, as the gains that earlier releases wrote into every file."""
+    return all(map(_are_ones, value)) if isinstance(value, list) else value == 1
 
 
 def _interval(low: float, high: float, value: Any) -> tuple[float, ...]:

@@ -265,6 +265,7 @@ OF_65 = {"sensor": np.arange(65).astype(str), "counts": np.zeros((65, 3, 4, 4), 
     [
         ("array 'format': 'tactile-results', .* play the .mcap", {"format": "tactile-results"}),
         ("array 'mountings': a file of an earlier release", {"mountings": "{}"}),
+        ("array 'source': a file of an earlier release", {"source": ["emulated"] * 4}),
         ("array 'version': 2, expected 1", {"version": 2}),
         ("array 'counts': missing", {"counts": None}),
         *(
@@ -294,6 +295,7 @@ def test_files_that_cannot_be_read(tmp_path):
         ("gone.csv", None, r"gone\.csv: cannot be read: No such file"),
         ("folder.csv", None, r"folder\.csv is a folder, expected a recording: it holds no \.mcap"),
         ("finger.txt", b"", r"ends in \.csv, \.npz or \.mcap"),
+        ("finger.csv", b"", "line 1: an empty file, expected a header and a row of counts"),
         ("finger.csv", HEADER.encode(), r"finger\.csv, .*expected a row of counts"),
         ("finger.npz", whole[:-1], "not a whole .npz archive"),
         ("finger.npz", whole[:600] + bytes([whole[600] ^ 0xFF]) + whole[601:], "finger"),

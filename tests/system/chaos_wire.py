@@ -1,6 +1,6 @@
 """Buses with faults between emulated sensors and whoever reads their adapters, over pseudo-terminals.
 
-    python tests/system/chaos_wire.py press.npz --link /tmp/skin --faults unplug@5+1,lost=0.05@8+2,mixed@12+60
+    python tests/system/chaos_wire.py press.mcap --link /tmp/skin --faults unplug@5+1,lost=0.05@8+2,mixed@12+60
 
 plays recordings over and over, with faults at their times since the channel was first opened:
 
