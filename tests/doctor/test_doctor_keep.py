@@ -117,10 +117,7 @@ EMULATED = SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, emulated=froz
 
 def test_a_device_refuses_an_emulated_sensor():
     words = r"has baseline of an emulated sensor 4, and this is a device: .*edge-sr doctor --out"
-    with (
-        pytest.raises(SensorFileError, match=words),
-        Source(FakeLink([], kind="device"), sensor_file=EMULATED),
-    ):
+    with pytest.raises(SensorFileError, match=words), Source(FakeLink([], kind="device"), sensor_file=EMULATED):
         pass
     with Source(FakeLink([], kind="emulated"), sensor_file=EMULATED):
         pass

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import write_recording as write_counts
-from cli_samples import TIMEOUT_S, assert_refused, base_options, files, records, run, start, write_recording
+from cli_samples import EDGE_SR, TIMEOUT_S, assert_refused, base_options, files, records, run, start, write_recording
 from edge_samples import BASELINE, ROOT, make_contract, wait_for, write_model
 
 from edge import __version__
@@ -41,9 +41,8 @@ class TestHelp:
     def test_the_short_help_has_the_usual_options_on_one_screen(self, capsys):
         assert cli.main(["-h"]) == 0
         lines = capsys.readouterr().out.splitlines()
-        options = [line.split()[0] for line in lines if line.startswith("  --")]
-        assert options == ["--version", "--source", "--sensor", "--model", "--sink", "--duration-s", "--view"]
-        assert len(lines) < 60 and lines[-1].startswith("edge-sr --help lists all options")
+        assert len(lines) < 60 and any("--source" in line for line in lines)
+        assert lines[-1].startswith("edge-sr --help lists all options")
 
     def test_help_fits_the_terminal_and_80_columns(self, capsys, monkeypatch):
         for columns, most in (("1", 40), ("40", 40), ("80", 80), ("200", 80)):
@@ -119,11 +118,7 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, f"{MAP} {{tmp}}/m.npz --centre-mm 0 nan", ["finite numbers"]),
         (3, f"{KNOWN} --source slcan:/dev/none --sink jsonl:{{tmp}}/kept.jsonl", ["/dev/none", "no such port"]),
         (3, f"{KNOWN} --source slcan:serial=NOSUCH", ["NOSUCH"]),
-        (
-            2,
-            f"{ZERO}{{files}}/rest.npz --out {{tmp}}/other.onnx",
-            ["other.onnx holds something else: give another"],
-        ),
+        (2, f"{ZERO}{{files}}/rest.npz --out {{tmp}}/other.onnx", ["other.onnx holds something else: give another"]),
         (3, f"{ZERO}{{tmp}}/moving.npz", ["nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by"]),
         (4, f"{REST} --model {{tmp}}/other.onnx", ["'pitch_mm' is 5.0", "4.7"]),
     ],
@@ -293,24 +288,20 @@ class TestEnds:
         assert lines[-1].startswith(f"edge-sr: no scan came from {name}: ") and lines[-1].endswith(doctor)
 
 
-def in_shell(redirection, *arguments, unbuffered):
+def in_shell(redirection, *arguments, unbuffered=""):
     """A run whose streams a shell has redirected; all that is left of them is read."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
-    environment |= {"PYTHONUNBUFFERED": "1"} if unbuffered else {}
-    return subprocess.run(
-        ["/bin/sh", "-c", f'exec "$@" {redirection}', "sh",
-         sys.executable, "-m", "edge.cli.main", *map(str, arguments)],
-        cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL, env=environment,
-    )  # fmt: skip
+    command = ["/bin/sh", "-c", f'exec "$@" {redirection}', "sh", *EDGE_SR, *map(str, arguments)]
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, env=environment)
 
 
 @pytest.mark.parametrize(
     ("command", "redirection", "why", "unbuffered"),
     [
-        ("demo --duration-s 0.1", ">/dev/full", "No space left", False),
-        ("models", ">/dev/full", "No space left", True),
-        ("models", ">&-", "Bad file descriptor", False),
-        ("--help", ">/dev/full", "No space left", False),
+        ("demo --duration-s 0.1", ">/dev/full", "No space left", ""),
+        ("models", ">/dev/full", "No space left", "1"),
+        ("models", ">&-", "Bad file descriptor", ""),
+        ("--help", ">/dev/full", "No space left", ""),
     ],
 )
 def test_a_stdout_that_takes_nothing_is_5_in_one_line(command, redirection, why, unbuffered):
@@ -323,7 +314,7 @@ def test_a_stdout_that_takes_nothing_is_5_in_one_line(command, redirection, why,
 @pytest.mark.parametrize("redirection", ["2>/dev/full", "<&- 2>&-"])
 def test_without_a_stderr_stdout_has_records_and_nothing_else(files, redirection):
     options = [*base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-"]
-    done = in_shell(redirection, *options, unbuffered=False)
+    done = in_shell(redirection, *options)
     assert done.returncode == 0 and done.stderr == ""
     assert len([json.loads(line) for line in done.stdout.splitlines()]) == 40
 
@@ -352,10 +343,7 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path):
         (tmp_path / "cell.csv", ",".join(columns) + "\n" + "1," * 47 + f'"{text}"\n'),
         (tmp_path / "head.csv", f'"{text}",' + ",".join(columns[1:]) + "\n"),
         (tmp_path / f"{name}.csv", ",".join(columns) + "\n" + (",".join(["30000"] * 48) + "\n") * 40),
-        (
-            tmp_path / "key.toml",
-            f'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n{key} = 1\n[sensors.4]\n',
-        ),
+        (tmp_path / "key.toml", f'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n{key} = 1\n[sensors.4]\n'),
     ):
         path.write_text(content, newline="")
         asked = ["--source", "demo", "--sensor", path] if path.suffix == ".toml" else ["replay", path, "--rate-hz", 100]

@@ -157,25 +157,19 @@ def test_usb_that_cannot_be_read_hides_no_port(plugged, gs_usb, capsys, monkeypa
     assert capsys.readouterr().out.splitlines()[-2:] == [why, SERVER_HINT]
 
 
-SPEAKERS = {
-    b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\n": "bytes came, and no CAN frame in them: ",
-    b"t1238AABBCCDDEEFF0011\r": "CAN frames came, and ",
-}
-"""Lines that another device sends over and over, each with the hint that is made of them."""
-
-
-@pytest.mark.parametrize("said", SPEAKERS)
-def test_what_is_wrong_is_read_from_what_came(said):
+def counted(said):
+    """Return what a link counts of the lines that another device sends over and over."""
     stages = SlcanScans()
     for time_ns in range(0, 100_000_000, 1_000_000):
         assert stages.feed(said, time_ns) == []
-    hint = silence_hint(["slcan:/dev/ttyUSB0"], lambda: stages.counters() | {"received_bytes": 100 * len(said)})
-    assert SPEAKERS[said] in hint and "edge-sr doctor --source slcan:/dev/ttyUSB0" in hint
+    return stages.counters() | {"received_bytes": 100 * len(said)}
 
 
 @pytest.mark.parametrize(
     ("counters", "words"),
     [
+        (counted(b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,*47\n"), "bytes came, and no CAN frame in them: "),
+        (counted(b"t1238AABBCCDDEEFF0011\r"), "CAN frames came, and "),
         ({"messages": 5}, "no whole scan in them"),
         ({"received_bytes": 12, "replies": 4}, "12 bytes came, the adapter's answers alone: is the sensor powered"),
         ({"frames": 0, "error_frames": 7}, "7 error frames .* 1 Mbit/s"),

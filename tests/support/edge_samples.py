@@ -1,12 +1,15 @@
 """Samples for the runtime's tests: a tiny real model, a sensor at rest and under load, scripted links."""
 
+import json
 import subprocess
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from math import prod
 from pathlib import Path
+from struct import unpack_from
 from types import SimpleNamespace
 from typing import Any
 
@@ -194,6 +197,18 @@ def make_scan(
     counts[:, ~fresh] = ABSENT
     time_ns = (number + 1) * PERIOD_NS if time_ns is None else time_ns
     return Scan(sensor, number, time_ns, counts, fresh, renewed)
+
+
+def unpack(message):
+    """Return header and maps of a packed message, by the layout in docs/middleware.md alone, all of which is used."""
+    (length,) = unpack_from("<I", message)
+    header, at, maps = json.loads(message[4 : 4 + length]), 4 + length, {}
+    assert at % 4 == 0
+    for name, shape in header["maps"]:
+        maps[name] = np.frombuffer(message, "<f4", prod(shape), at).reshape(shape)
+        at += maps[name].nbytes
+    assert at == len(message)
+    return header, maps
 
 
 @contextmanager

@@ -78,11 +78,7 @@ def same_scan(got: Scan, scan: Scan) -> bool:
 
 
 def messages_alone(
-    path: Path,
-    to: Path,
-    topics: str | None = None,
-    start_ns: int | None = None,
-    more: Path | None = None,
+    path: Path, to: Path, topics: str | None = None, start_ns: int | None = None, more: Path | None = None
 ) -> Path:
     """Copy messages of these topics and times (all by default), as tools do: without metadata and attachments.
 

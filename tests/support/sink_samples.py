@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
+from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan, unpack
 from mcap_samples import messages_of
-from packed_messages import unpack
 
 from edge.perception.event import Event, Note
 from edge.perception.result import Result

@@ -243,7 +243,7 @@ def test_clients_leave_nothing_behind(page, client):
     gc.collect()
     with uncollected():
         at_rest = left()
-        come_and_go(3 * TIDY_CONNECTIONS)
+        come_and_go(2 * TIDY_CONNECTIONS)
         wait_for(lambda: left() == at_rest)
         assert lost() < 1.5 * TIDY_CONNECTIONS, "some were still closing when the others were collected"
         assert get(page)[0] == 200
