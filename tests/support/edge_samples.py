@@ -333,6 +333,15 @@ def fake_source(kind: SourceKind = "replay", *, unix_offset_ns=None, origin=None
     return SimpleNamespace(kind=kind, unix_offset_ns=unix_offset_ns, origin=origin, sensor_file=file)
 
 
+class Clock:
+    """Clock that a test sets."""
+
+    now_ns = 10**12
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
 class ListSink(Sink):
     """Sink that keeps the results it gets."""
 
