@@ -58,26 +58,20 @@ class TestHelp:
         assert (done.returncode, done.stdout, done.stderr) == (0, f"edge-sr {__version__}\n", "")
 
 
-class TestModels:
-    def test_models_are_listed_from_their_contracts(self, bundle, capsys):
-        write_model(bundle / "mtsr4.onnx")
-        sure = {"1": {"psnr_db": 30.1, "coverage_90": 0.9034}}
-        write_model(bundle / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
-        assert cli.main(["models"]) == 0
-        out = capsys.readouterr().out.splitlines()
-        size_mb = (bundle / "mtsr4.onnx").stat().st_size / 1e6
-        assert out[1].split() == ["mtsr4", "4", f"{size_mb:.1f}", "float32", "33.2", "2.10", "-"]
-        assert out[2].split() == ["stsr", "1", f"{size_mb:.1f}", "float32", "30.1", "-", "-"]
-        assert max(map(len, out)) <= 80
-
-    def test_run_times_are_measured_next_to_the_error(self, bundle, limits, capsys):
-        limits(listings, RATE_HZ=2000.0)
-        write_model(bundle / "mtsr4.onnx")
-        assert cli.main(["models", "--measure"]) == 0
-        head, row, _, note, *_ = capsys.readouterr().out.splitlines()
-        assert "p50 us p99 us" in head and note == "run times of 150 patterns each at 2000 Hz, on one thread"
-        *figures, p50, p99 = row.split()[4:]
-        assert 0 < int(p50) <= int(p99) and figures == ["33.2", "2.10", "-"] and max(map(len, (head, row))) <= 80
+@pytest.mark.parametrize("options", [[], ["--measure"]])
+def test_models_are_listed_with_their_errors_and_run_times(options, bundle, limits, capsys):
+    limits(listings, RATE_HZ=2000.0)
+    write_model(bundle / "mtsr4.onnx")
+    sure = {"1": {"psnr_db": 30.1, "coverage_90": 0.9034}}
+    write_model(bundle / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
+    assert cli.main(["models", *options]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    size_mb = (bundle / "mtsr4.onnx").stat().st_size / 1e6
+    assert rows[0].split()[:7] == ["mtsr4", "4", f"{size_mb:.1f}", "float32", "33.2", "2.10", "-"]
+    assert rows[1].split()[:7] == ["stsr", "1", f"{size_mb:.1f}", "float32", "30.1", "-", "-"]
+    assert max(map(len, (head, *rows[:2]))) <= 80 and ("p50 us p99 us" in head) == bool(options)
+    times_us = [int(one) for one in rows[0].split()[7:]]
+    assert times_us == sorted(times_us) and len(times_us) == 2 * len(options) and all(one > 0 for one in times_us)
 
 
 def test_a_demo_that_ends_before_its_first_tap_says_so(files, capsys):
