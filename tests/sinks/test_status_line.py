@@ -85,7 +85,6 @@ class TestStatus:
             ),
             (60, "EMULATED | 4 contact not checked 3007 counts 22 mm2 ..."),
             (20, "EMULATED ..."),
-            (10, " ..."),
             (4, " .."),
         ],
     )
