@@ -242,7 +242,7 @@ def test_ctrl_c_tells_what_was_found_and_is_130(tmp_path):
     with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
         process = start("doctor", "--source", f"slcan:{emulator.port}", "--out", tmp_path / "s")
         assert process.stderr is not None and "watching for 60 s" in process.stderr.readline()
-        time.sleep(0.9)
+        time.sleep(1.5)
         process.send_signal(signal.SIGINT)
         out, errors = process.communicate(timeout=60)
     assert "not written, because the free pad was not measured to the end" in errors

@@ -215,15 +215,15 @@ ZERO, SCALE = "zero after a grip", "scale in a grip"
         ({"b": Weighed(1000.0, 0.0)}, -1.25, 0, {"a": (800.0, 0.045)}, {}),
         ({"a": Weighed(1000.0, 0.06), "b": Weighed(1250.0, 0.06)}, -1.25, 0, {}, {}),
         ({"a": Weighed(1000.0, 0.06), "b": Weighed(1000.0, 0.06)}, -1.25, 0, {}, {SCALE: "wrong"}),
-        ({"a": Weighed(1000.0, 0.06)}, -3.0, 0, {}, {SCALE: "look"}),
-        ({}, -1.25, 900, {}, {ZERO: "wrong", SCALE: "not known"}),
-        ({"a": Weighed(1000.0, 0.06)}, -1.25, 600, {}, {ZERO: "wrong"}),
-        ({"a": Weighed(1000.0, 0.0)}, -1.25, 250, {"b": (1250.0, 0.067)}, {}),
+        ({"a": Weighed(1000.0, 0.06)}, -0.4, 0, {}, {SCALE: "look"}),
+        ({}, -1.25, 1800, {}, {ZERO: "wrong", SCALE: "not known"}),
+        ({"a": Weighed(1000.0, 0.06)}, -1.25, 1200, {}, {ZERO: "wrong"}),
+        ({"a": Weighed(1000.0, 0.0)}, -1.25, 500, {"b": (1250.0, 0.067)}, {}),
     ],
 )
 def test_a_grip_gives_a_pad_the_scale_of_its_partner(weighed, ratio, rest, found, wrong):
     grip = Grip(("a", "b"))
-    for scan, z in enumerate([0] * 20 + [4000] * 120 + [0] * 30):
+    for scan, z in enumerate([0] * 20 + [8000] * 120 + [0] * 30):
         assert not grip.over or scan > 140
         grip.push("a", scan / 100, z)
         grip.push("b", scan / 100 + 0.003, ratio * z - rest * (scan >= 140))

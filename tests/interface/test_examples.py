@@ -172,6 +172,7 @@ def reading(state="idle", sensor="4", **said):
 
 
 SILENT = Note("dead", "taxel 3 was not received")
+DOUBT = Note("baseline_in_doubt", "zero again")
 UNTRUSTED = {"trusted": False, "untrusted_reason": "unfamiliar"}
 WRONG = {
     "the reading is 50": {"age_ms": 5000},
@@ -180,12 +181,7 @@ WRONG = {
     "not ready: zeroing": {"state": "zeroing", "force_counts": None},
     "not to be believed: readings like no contact": {"state": "contact", "area_mm2": 50.0} | UNTRUSTED,
     "50 mm2 touch": {"state": "contact", "area_mm2": 50.0},
-    "not ready: zero again": {
-        "state": "baseline_in_doubt",
-        "notes": (Note("baseline_in_doubt", "zero again"),),
-        "trusted": False,
-        "area_mm2": 50.0,
-    },
+    "not ready: zero again": {"state": "baseline_in_doubt", "notes": (DOUBT,), "trusted": False, "area_mm2": 50.0},
     "the force is 21000 counts": {"state": "dropped", "force_counts": 21_000.0},
 }
 
