@@ -41,6 +41,7 @@ WATCH_REFUSAL = """() => {
   const watch = { attributeFilter: ["hidden"], childList: true, subtree: true };
   new MutationObserver(() => window.refusals++).observe(document.querySelector("#refusal"), watch);
 }"""
+AS_SHOWN = "canvas => Math.abs(canvas.width - canvas.clientWidth * devicePixelRatio) < 2"
 INKED = """canvas => {
   const { data, width, height } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
   const ink = getComputedStyle(document.documentElement).getPropertyValue("--force").trim();
@@ -129,7 +130,7 @@ def test_a_held_pad_is_shown_and_measured(held, open_page):
     for width, height in web.SIZES:
         web.fits(page, width, height)
     web.fits(page, *web.PHONE)
-    assert web.part(page, "over").evaluate(web.PAINTED) > 50
+    assert web.part(page, "force-plot").evaluate(AS_SHOWN) and web.part(page, "force-plot").evaluate(web.PAINTED) > 50
     field = web.part(page, "field").bounding_box()
     assert field["width"] > 330 and field["y"] + field["height"] < page.locator("#keys").bounding_box()["y"]
 
