@@ -62,10 +62,7 @@ def _unknown(value: Any) -> str:
     return "" if value is None else f"{value:g}".replace("nan", "NaN")
 
 
-TABLES = {
-    ("formats.md", "record"): record_table,
-    ("middleware.md", "shm"): memory_table,
-}
+TABLES = {("formats.md", "record"): record_table, ("middleware.md", "shm"): memory_table}
 
 
 def with_tables(page: str) -> str:

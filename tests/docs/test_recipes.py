@@ -100,7 +100,7 @@ def test_two_fingers_are_compared(cook):
 
 
 def test_separate_contacts_begin_and_end(cook):
-    _, out = cook("Separate contacts, and slip", rate_hz=200)
+    _, out = cook("Separate contacts, and slip", rate_hz=500)
     told = [re.fullmatch(r"contact (\d+): (begin|move|slip|end), -?\d+ deg, \d+ x \d+ mm", line) for line in out]
     kinds = [one[2] for one in told if one]
     assert kinds.count("begin") >= kinds.count("end") >= 4

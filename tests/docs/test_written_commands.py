@@ -14,10 +14,10 @@ import shutil
 import subprocess
 import tomllib
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-import written_samples
 from bridge_samples import write_recording
 from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT
@@ -34,7 +34,67 @@ from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import save_baselines
 
-COMMANDS = written_samples.commands()
+PAGES = (
+    ROOT / "README.md",
+    *sorted(page for page in (ROOT / "docs").glob("*.md") if page.stem not in ("decisions", "changelog")),
+)
+"""Pages whose commands must work; the others name commands and options as they were."""
+LANGUAGES = {"sh", "python", "text", "json", "toml", "html", "ini", "xml", "c", "nginx"}
+_FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+_INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
+_INDENTED = re.compile(r"(?<=\n\n)( {4,7})(?![-*] |\d+\. )\S.*\n(?:(?:\1.*|\n(?=\1))(?:\n|\Z))*")
+_COMMENT = re.compile(r"(?:^|\s)#.*")
+_RUNNABLE = re.compile(r"(?:edge-sr|make|pip install|python3?|sudo|torchrun|git|echo|ros2|ulimit) \S")
+NAMED = re.compile(r"edge-sr ([a-z]+)")
+"""A command that is spoken of, not one to be typed."""
+_MAKEFILE = re.compile(
+    r"^\t(?:\w+=\S+ )*\$\(BIN\)/((?:python -m (?!pip|pytest)|edge-sr|torchrun|mkdocs).*)$", re.MULTILINE
+)
+
+
+class Block(NamedTuple):
+    """A block of a page: fenced, or indented, which is of commands if one of its lines is."""
+
+    page: str
+    language: str
+    text: str
+
+
+def blocks() -> list[Block]:
+    found = []
+    for page in PAGES:
+        for indent, language, text in _FENCE.findall(page.read_text()):
+            lines = [line.removeprefix(indent) for line in text.splitlines()]
+            found.append(Block(page.name, language, "\n".join(lines)))
+        for block in _INDENTED.finditer(unfenced(page)):
+            lines = [line.removeprefix(block[1]) for line in block[0].splitlines()]
+            language = "sh" if any(map(_RUNNABLE.match, lines)) else "text"
+            found.append(Block(page.name, language, "\n".join(lines)))
+    return found
+
+
+def unfenced(page: Path) -> str:
+    """Return the text outside the blocks."""
+    return _FENCE.sub("", page.read_text())
+
+
+def inline(page: Path) -> list[str]:
+    """Return the texts between backticks."""
+    return [" ".join(text.replace("\\|", "|").split()) for text in _INLINE.findall(unfenced(page))]
+
+
+def commands() -> list[str]:
+    """Return every command of the pages and of the Makefile once."""
+    shell = "\n".join(block.text for block in blocks() if block.language == "sh").replace("\\\n", " ")
+    found = [" ".join(_COMMENT.sub("", line).split()) for line in shell.splitlines()]
+    spoken = [text for page in PAGES for text in inline(page) if _RUNNABLE.match(text) and "..." not in text]
+    found += [text for text in spoken if not NAMED.fullmatch(text)]
+    made = _MAKEFILE.findall((ROOT / "Makefile").read_text())
+    found += [command.replace("$(NETWORKS)", "mine/stsr.pt").replace("$@", "out.npz") for command in made]
+    return list(filter(None, dict.fromkeys(found)))
+
+
+COMMANDS = commands()
 RATE_HZ = 500
 TAPS_SCANS = 460
 """Scans of the demo up to the end of its four taps."""
@@ -70,7 +130,7 @@ LEFT_OUT = {
     r"python examples/(print_force|stop_on_area)\.py .*": "goes on until it is ended; test_examples runs them",
     r"python examples/lerobot_camera_tactile_sr/observe\.py .*": "needs LeRobot; test_lerobot runs it",
     r"python examples/train_and_deploy\.py .*": "trains for minutes; test_examples runs it, shortened",
-    r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_page_sensors takes one",
+    r"python docs/live_pictures\.py": "pictures a browser for half a minute, which is looked at",
     r"mkdocs build .*": "test_site builds the site",
     r"python tests/docs/field_tables\.py": "writes the pages themselves; test_written_figures compares them",
 }
@@ -196,7 +256,7 @@ def shortened(words: list[str]) -> list[str]:
     if words[1] in ("baseline", "models", "devices", "bench", "convert"):
         return words
     if "--view" in words or not ("replay" in words or "demo" in words or any("replay:" in word for word in words)):
-        words = [*words, "--duration-s", "2"]  # the others end by themselves
+        words = [*words, "--duration-s", "1"]  # the others end by themselves
     if "demo" in words or any(word.startswith("replay:") for word in words):
         words = [*words, "--rate-hz", str(RATE_HZ)]
     return words
@@ -260,16 +320,11 @@ def test_every_command_is_run_by_one_of_these_tests():
 
 
 def test_every_block_tells_its_language_so_that_no_command_hides():
-    assert [block for block in written_samples.blocks() if block.language not in written_samples.LANGUAGES] == []
+    assert [block for block in blocks() if block.language not in LANGUAGES] == []
 
 
 def test_commands_that_are_spoken_of_exist():
-    spoken = {
-        match[1]
-        for page in written_samples.PAGES
-        for text in written_samples.inline(page)
-        if (match := written_samples.NAMED.fullmatch(text))
-    }
+    spoken = {match[1] for page in PAGES for text in inline(page) if (match := NAMED.fullmatch(text))}
     assert spoken >= {"doctor"} and spoken <= set(cli.COMMANDS)
 
 
@@ -281,14 +336,14 @@ def test_options_that_are_spoken_of_exist():
         for option in re.findall(r'"(--[a-z][a-z0-9-]*)[ "]', path.read_text())
     }
     known |= {"--help", "--nproc-per-node"}  # argparse's, torchrun's
-    for page in written_samples.PAGES:
-        for text in written_samples.inline(page):
+    for page in PAGES:
+        for text in inline(page):
             for option in re.findall(r"(?<!\S)(--[a-z][a-z0-9-]*)", text):
                 assert option in known, f"{page.name}: {text}"
 
 
 def test_every_option_is_spoken_of():
-    spoken = {option for page in written_samples.PAGES for option in re.findall(r"--[a-z][a-z0-9-]*", page.read_text())}
+    spoken = {option for page in PAGES for option in re.findall(r"--[a-z][a-z0-9-]*", page.read_text())}
     for command in ("", *cli.COMMANDS):
         options = set(re.findall(r"^ *(--[a-z][a-z0-9-]*)", cli.parser(command).format_help(), re.MULTILINE))
         assert options - {"--version"} <= spoken, f"edge-sr {command}: {options - spoken}"  # this is as anywhere
@@ -298,7 +353,7 @@ def test_every_option_is_spoken_of():
     "snippet",
     [
         pytest.param(one.text, id=f"{one.page}-{at}")
-        for at, one in enumerate(written_samples.blocks())
+        for at, one in enumerate(blocks())
         if one.language == "python" and one.page != "recipes.md"  # which test_recipes runs
     ],
 )

@@ -191,13 +191,7 @@ class TestLine:
 
     @pytest.mark.parametrize(
         ("baud", "rate_hz", "verdict"),
-        [
-            (3_000_000, 100, "ok"),
-            (115_200, 32, "wrong"),
-            (230_400, 60, "wrong"),
-            (230_400, 20, "look"),
-            (115_200, 100, "ok"),
-        ],
+        [(3_000_000, 100, "ok"), (115_200, 32, "wrong"), (230_400, 20, "look"), (115_200, 100, "ok")],
     )
     def test_baud(self, baud, rate_hz, verdict):
         counters = {"received_bytes": 22 * 16 * rate_hz * 4, "frames": 16 * rate_hz * 4}

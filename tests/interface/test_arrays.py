@@ -67,14 +67,8 @@ def test_arrays_of_floats_and_in_the_vendors_order_are_taken(counts, baseline):
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (
-            {"counts": COUNTS + 0.5},
-            "counts are not whole numbers, expected raw counts: no means",
-        ),
-        (
-            {"counts": COUNTS.astype(str)},
-            "counts are of type <U.*, expected whole numbers: raw counts, nothing subtracted",
-        ),
+        ({"counts": COUNTS + 0.5}, "counts are not whole numbers, expected raw counts: no means"),
+        ({"counts": COUNTS.astype(str)}, "counts are of type <U.*, expected whole numbers: raw counts, nothing sub"),
         ({"counts": COUNTS.astype(np.float16)}, "counts are of type float16, expected whole numbers"),
         ({"baseline": np.full((3, 4, 4), np.nan)}, "counts of the baseline hold NaN or infinity, expected raw counts"),
         ({"counts": COUNTS[:, :2]}, r"counts have shape \(15, 2, 4, 4\), expected \(3, rows, cols\) or \(n, 3, rows"),
@@ -85,7 +79,6 @@ def test_arrays_of_floats_and_in_the_vendors_order_are_taken(counts, baseline):
         ({"baseline": REST[:, :2]}, r"baseline of sensor array has shape \(3, 2, 4\), expected \(3, 4, 4\)"),
         ({"rate_hz": 0}, "rate_hz is 0, expected a positive number"),
         ({"counts": np.ma.masked_greater(COUNTS, 37_500)}, "counts are masked in part, .*: -1 where there is no"),
-        ({"baseline": np.ma.masked_greater(REST, 33_000)}, "counts of the baseline are masked in part"),
         ({"counts": [[1], [2, 3]]}, "counts are no array of numbers: "),
     ],
 )
@@ -95,8 +88,7 @@ def test_an_array_of_something_else_is_refused(wrong, words):
 
 
 @pytest.mark.parametrize(
-    "counts",
-    [COUNTS[0], COUNTS[:0], COUNTS - 70_000, COUNTS * np.nan, COUNTS > 0, np.ma.masked_greater(COUNTS, 1)],
+    "counts", [COUNTS[0], COUNTS[:0], COUNTS - 70_000, COUNTS * np.nan, COUNTS > 0, np.ma.masked_greater(COUNTS, 1)]
 )
 def test_a_baseline_is_made_of_raw_counts_that_all_count(counts):
     with pytest.raises(BaselineRefusedError, match=r"^counts of sensor 4: .*expected"):

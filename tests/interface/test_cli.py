@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import write_recording as write_counts
-from cli_samples import TIMEOUT_S, assert_refused, base_options, files, records, run, start, write_recording
+from cli_samples import EDGE_SR, TIMEOUT_S, assert_refused, base_options, files, records, run, start, write_recording
 from edge_samples import BASELINE, ROOT, make_contract, wait_for, write_model
 
 from edge import __version__
@@ -41,9 +41,8 @@ class TestHelp:
     def test_the_short_help_has_the_usual_options_on_one_screen(self, capsys):
         assert cli.main(["-h"]) == 0
         lines = capsys.readouterr().out.splitlines()
-        options = [line.split()[0] for line in lines if line.startswith("  --")]
-        assert options == ["--version", "--source", "--sensor", "--model", "--sink", "--duration-s", "--view"]
-        assert len(lines) < 60 and lines[-1].startswith("edge-sr --help lists all options")
+        assert len(lines) < 60 and any("--source" in line for line in lines)
+        assert lines[-1].startswith("edge-sr --help lists all options")
 
     def test_help_fits_the_terminal_and_80_columns(self, capsys, monkeypatch):
         for columns, most in (("1", 40), ("40", 40), ("80", 80), ("200", 80)):
@@ -59,26 +58,20 @@ class TestHelp:
         assert (done.returncode, done.stdout, done.stderr) == (0, f"edge-sr {__version__}\n", "")
 
 
-class TestModels:
-    def test_models_are_listed_from_their_contracts(self, bundle, capsys):
-        write_model(bundle / "mtsr4.onnx")
-        sure = {"1": {"psnr_db": 30.1, "coverage_90": 0.9034}}
-        write_model(bundle / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
-        assert cli.main(["models"]) == 0
-        out = capsys.readouterr().out.splitlines()
-        size_mb = (bundle / "mtsr4.onnx").stat().st_size / 1e6
-        assert out[1].split() == ["mtsr4", "4", f"{size_mb:.1f}", "float32", "33.2", "2.10", "-"]
-        assert out[2].split() == ["stsr", "1", f"{size_mb:.1f}", "float32", "30.1", "-", "-"]
-        assert max(map(len, out)) <= 80
-
-    def test_run_times_are_measured_next_to_the_error(self, bundle, limits, capsys):
-        limits(listings, RATE_HZ=2000.0)
-        write_model(bundle / "mtsr4.onnx")
-        assert cli.main(["models", "--measure"]) == 0
-        head, row, _, note, *_ = capsys.readouterr().out.splitlines()
-        assert "p50 us p99 us" in head and note == "run times of 150 patterns each at 2000 Hz, on one thread"
-        *figures, p50, p99 = row.split()[4:]
-        assert 0 < int(p50) <= int(p99) and figures == ["33.2", "2.10", "-"] and max(map(len, (head, row))) <= 80
+@pytest.mark.parametrize("options", [[], ["--measure"]])
+def test_models_are_listed_with_their_errors_and_run_times(options, bundle, limits, capsys):
+    limits(listings, RATE_HZ=2000.0)
+    write_model(bundle / "mtsr4.onnx")
+    sure = {"1": {"psnr_db": 30.1, "coverage_90": 0.9034}}
+    write_model(bundle / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
+    assert cli.main(["models", *options]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    size_mb = (bundle / "mtsr4.onnx").stat().st_size / 1e6
+    assert rows[0].split()[:7] == ["mtsr4", "4", f"{size_mb:.1f}", "float32", "33.2", "2.10", "-"]
+    assert rows[1].split()[:7] == ["stsr", "1", f"{size_mb:.1f}", "float32", "30.1", "-", "-"]
+    assert max(map(len, (head, *rows[:2]))) <= 80 and ("p50 us p99 us" in head) == bool(options)
+    times_us = [int(one) for one in rows[0].split()[7:]]
+    assert times_us == sorted(times_us) and len(times_us) == 2 * len(options) and all(one > 0 for one in times_us)
 
 
 def test_a_demo_that_ends_before_its_first_tap_says_so(files, capsys):
@@ -118,11 +111,7 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, f"{MAP} {{tmp}}/m.npz --centre-mm 0 nan", ["finite numbers"]),
         (3, f"{KNOWN} --source slcan:/dev/none --sink jsonl:{{tmp}}/kept.jsonl", ["/dev/none", "no such port"]),
         (3, f"{KNOWN} --source slcan:serial=NOSUCH", ["NOSUCH"]),
-        (
-            2,
-            f"{ZERO}{{files}}/rest.npz --out {{tmp}}/other.onnx",
-            ["other.onnx holds something else: give another"],
-        ),
+        (2, f"{ZERO}{{files}}/rest.npz --out {{tmp}}/other.onnx", ["other.onnx holds something else: give another"]),
         (3, f"{ZERO}{{tmp}}/moving.npz", ["nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by"]),
         (4, f"{REST} --model {{tmp}}/other.onnx", ["'pitch_mm' is 5.0", "4.7"]),
     ],
@@ -292,24 +281,20 @@ class TestEnds:
         assert lines[-1].startswith(f"edge-sr: no scan came from {name}: ") and lines[-1].endswith(doctor)
 
 
-def in_shell(redirection, *arguments, unbuffered):
+def in_shell(redirection, *arguments, unbuffered=""):
     """A run whose streams a shell has redirected; all that is left of them is read."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
-    environment |= {"PYTHONUNBUFFERED": "1"} if unbuffered else {}
-    return subprocess.run(
-        ["/bin/sh", "-c", f'exec "$@" {redirection}', "sh",
-         sys.executable, "-m", "edge.cli.main", *map(str, arguments)],
-        cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL, env=environment,
-    )  # fmt: skip
+    command = ["/bin/sh", "-c", f'exec "$@" {redirection}', "sh", *EDGE_SR, *map(str, arguments)]
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, env=environment)
 
 
 @pytest.mark.parametrize(
     ("command", "redirection", "why", "unbuffered"),
     [
-        ("demo --duration-s 0.1", ">/dev/full", "No space left", False),
-        ("models", ">/dev/full", "No space left", True),
-        ("models", ">&-", "Bad file descriptor", False),
-        ("--help", ">/dev/full", "No space left", False),
+        ("demo --duration-s 0.1", ">/dev/full", "No space left", ""),
+        ("models", ">/dev/full", "No space left", "1"),
+        ("models", ">&-", "Bad file descriptor", ""),
+        ("--help", ">/dev/full", "No space left", ""),
     ],
 )
 def test_a_stdout_that_takes_nothing_is_5_in_one_line(command, redirection, why, unbuffered):
@@ -322,7 +307,7 @@ def test_a_stdout_that_takes_nothing_is_5_in_one_line(command, redirection, why,
 @pytest.mark.parametrize("redirection", ["2>/dev/full", "<&- 2>&-"])
 def test_without_a_stderr_stdout_has_records_and_nothing_else(files, redirection):
     options = [*base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-"]
-    done = in_shell(redirection, *options, unbuffered=False)
+    done = in_shell(redirection, *options)
     assert done.returncode == 0 and done.stderr == ""
     assert len([json.loads(line) for line in done.stdout.splitlines()]) == 40
 
@@ -351,10 +336,7 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path):
         (tmp_path / "cell.csv", ",".join(columns) + "\n" + "1," * 47 + f'"{text}"\n'),
         (tmp_path / "head.csv", f'"{text}",' + ",".join(columns[1:]) + "\n"),
         (tmp_path / f"{name}.csv", ",".join(columns) + "\n" + (",".join(["30000"] * 48) + "\n") * 40),
-        (
-            tmp_path / "key.toml",
-            f'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n{key} = 1\n[sensors.4]\n',
-        ),
+        (tmp_path / "key.toml", f'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n{key} = 1\n[sensors.4]\n'),
     ):
         path.write_text(content, newline="")
         asked = ["--source", "demo", "--sensor", path] if path.suffix == ".toml" else ["replay", path, "--rate-hz", 100]

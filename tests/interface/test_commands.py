@@ -145,12 +145,12 @@ TIMEOUT_S = 60.0
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory):
-    """Options of a run of 25 s, of which the first seven are pressed."""
+    """Options of a run of 25 s, of which the first four are pressed."""
     folder = tmp_path_factory.mktemp("long")
     # Pressed on many taxels: one alone that reads so much is not believed after a while, and then it may be zeroed.
     path = write_recording(folder / "rest.npz", [0] * 5000, period_ns=5_000_000)
     arrays = dict(np.load(path))
-    arrays["counts"][:1400, 2, 1:3, 1:3] += 1000  # local, so that it needs no rest before it
+    arrays["counts"][:800, 2, 1:3, 1:3] += 1000  # local, so that it needs no rest before it
     np.savez(path, **arrays)
     save_baselines(folder / "zero.json", [BASELINE])
     options = ["--model", write_model(folder / "tiny.onnx"), "--baseline", folder / "zero.json"]

@@ -56,7 +56,6 @@ class TestFields:
             ({"x_mm": 0, "y_mm": 0, "time_ns": 1.5}, "time_ns is 1.5"),
             ({"x_mm": 0, "y_mm": 0, "time_ns": -1}, "time_ns is -1"),
             ({"x_mm": 0, "y_mm": 0, "time_ns": 1_700_000_000 * 10**9}, "s ahead of now"),
-            ({"x_mm": 0, "y_mm": 0, "time_ns": 10**400}, "time_ns is 1000"),
             ({"cmd": "zero", "x_mm": 0, "y_mm": 0}, "cmd is 'zero'"),
         ],
     )

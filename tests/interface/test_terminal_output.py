@@ -95,7 +95,7 @@ def test_nothing_without_a_terminal_or_beyond_torchruns_first(terminal, monkeypa
     assert pipe.getvalue() == terminal.said() == ""
 
 
-ODD = ["a  b", "it's", "a;b$c`d", "tab\there\nthere", "\x1b[31mred", "back\\slash\x1b", "\x9b\u202eé", "\udcff"]
+ODD = ["a  b", "it's;$c`d", "tab\there\nthere", "back\\slash\x1b", "\x9b\u202eé\udcff"]
 
 
 @pytest.mark.parametrize("name", ODD)

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sink_samples import CONTRACT, RUN, make_results, make_sure_results
 
-from edge.api import Event, Runtime, SinkError
+from edge.api import Runtime, SinkError
 from edge.sinks.json_records import ALWAYS, has_room, pack, record_line
 from edge.sinks.registry import open_sink
 from firmware_bridge.scans.scan import VendorReading
@@ -121,14 +121,6 @@ class TestJsonLines:
         got = json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))["pattern"]
         np.testing.assert_allclose(got, pattern, rtol=2e-7, atol=0.51e-7)
         assert line.endswith(b"}\n") and line.count(b"\n") == 1
-
-    def test_an_event_is_a_record_told_by_its_state(self, tmp_path):
-        sink = open_sink(f"jsonl:{tmp_path}/out.jsonl", CONTRACT, fake_source())
-        sink.tell(Event(5, "lost", None, "the cable is out"), {"scans": 3})
-        sink.close()
-        told = {"time_ns": 5, "sensor": None, "source": "replay", "state": "event", "event": "lost"}
-        told |= {"note": "the cable is out", "counters": {"scans": 3, "unwritten": 0}}
-        assert json.loads((tmp_path / "out.jsonl").read_text()) == told
 
     def test_a_slow_reader_holds_up_nothing_and_its_loss_is_counted(self, tmp_path):
         """Every record is written or counted, and each that is written is whole."""

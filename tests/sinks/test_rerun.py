@@ -45,16 +45,9 @@ def opened(target):
     return open_sink(f"rerun:{target}", CONTRACT, fake_source(kind="emulated"))
 
 
-@pytest.mark.parametrize(
-    ("target", "words"),
-    [
-        ("press.mcap", r"expected rerun:view for a viewer of its own, rerun:HOST:PORT .*, or rerun:FILE\.rrd"),
-        ("127.0.0.1", "names '127.0.0.1', expected rerun:view"),
-        ("", "no sink 'rerun:'; sinks are .*rerun:view"),
-    ],
-)
-def test_another_target_is_refused(target, words):
-    with pytest.raises(UsageError, match=words):
+@pytest.mark.parametrize("target", ["press.mcap", "127.0.0.1", ""])
+def test_another_target_is_refused(target):
+    with pytest.raises(UsageError, match="rerun:view"):
         check_sink(f"rerun:{target}")
 
 

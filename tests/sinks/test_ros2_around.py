@@ -17,7 +17,7 @@ import numpy as np
 import ros2_messages
 import yaml
 from cyclonedds.idl import IdlStruct, types
-from edge_samples import BASELINE, ROOT, fake_source, make_contract, make_scan, make_wrench_result
+from edge_samples import BASELINE, ROOT, Clock, fake_source, make_contract, make_scan, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import make_results, odd_scans
@@ -38,14 +38,6 @@ from firmware_bridge.links.base import Notice
 from firmware_bridge.recording.cdr import MessageType
 
 __all__ = ["sink"]
-
-
-class Clock:
-    def __init__(self):
-        self.now_ns = 10**12
-
-    def __call__(self):
-        return self.now_ns
 
 
 def kept(kind="device", *, unix_offset_ns=None, **settings):

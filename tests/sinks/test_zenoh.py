@@ -16,8 +16,7 @@ import pytest
 import zenoh_samples
 from bridge_samples import write_recording
 from cli_samples import start
-from edge_samples import ROOT, ended, fake_source, make_scan, wait_for, write_model
-from packed_messages import unpack
+from edge_samples import ROOT, ended, fake_source, make_scan, unpack, wait_for, write_model
 from test_listening import reachable
 from zenoh_samples import CONTRACT, consume, endpoint, listening, make_results
 

@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import write_npz
-from edge_samples import ROOT, wait_for
+from edge_samples import ROOT, unpack, wait_for
 from matplotlib import colormaps
-from packed_messages import unpack
 
 from edge.api import load_model
 from edge.inference.bundled import demo_recording
@@ -33,6 +32,7 @@ if os.environ.get("EDGE_BROWSER") != "1":  # a machine with 1 must have both, so
         pytest.skip("no chromium here: apt-get install chromium", allow_module_level=True)
     pytest.importorskip("playwright.sync_api")
 playwright = import_module("playwright.sync_api")
+expect = playwright.expect
 
 TIMEOUT_MS = 60_000
 PERIOD_NS = 10_000_000
@@ -204,7 +204,7 @@ def number(page, name, sensor="4"):
 
 def moves(page):
     before = part(page, "force-now").inner_text()
-    playwright.expect(part(page, "force-now")).not_to_have_text(before)
+    expect(part(page, "force-now")).not_to_have_text(before)
 
 
 def live(page):
@@ -212,11 +212,11 @@ def live(page):
 
 
 def word(page, text, sensor="4"):
-    playwright.expect(part(page, "word", sensor)).to_contain_text(text)
+    expect(part(page, "word", sensor)).to_contain_text(text)
 
 
 def logged(page, text):
-    playwright.expect(page.locator("#log li").filter(has_text=text).first).to_be_visible()
+    expect(page.locator("#log li").filter(has_text=text).first).to_be_visible()
 
 
 def frames_of(page):

@@ -1,12 +1,15 @@
 """Samples for the runtime's tests: a tiny real model, a sensor at rest and under load, scripted links."""
 
+import json
 import subprocess
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from math import prod
 from pathlib import Path
+from struct import unpack_from
 from types import SimpleNamespace
 from typing import Any
 
@@ -196,6 +199,18 @@ def make_scan(
     return Scan(sensor, number, time_ns, counts, fresh, renewed)
 
 
+def unpack(message):
+    """Return header and maps of a packed message, by the layout in docs/middleware.md alone, all of which is used."""
+    (length,) = unpack_from("<I", message)
+    header, at, maps = json.loads(message[4 : 4 + length]), 4 + length, {}
+    assert at % 4 == 0
+    for name, shape in header["maps"]:
+        maps[name] = np.frombuffer(message, "<f4", prod(shape), at).reshape(shape)
+        at += maps[name].nbytes
+    assert at == len(message)
+    return header, maps
+
+
 @contextmanager
 def ended(process: subprocess.Popen, within_s: float = 60) -> Iterator[subprocess.Popen]:
     """Yield a process, and kill it at the end of the block, or after a time so that no reader waits for ever."""
@@ -316,6 +331,15 @@ def fake_source(kind: SourceKind = "replay", *, unix_offset_ns=None, origin=None
     """Return what sinks see of an open source: `of_sensors` is what its sensor file says."""
     file = SimpleNamespace(**{"mountings": {}, "frames": {}, "geometry": USPA44} | of_sensors)
     return SimpleNamespace(kind=kind, unix_offset_ns=unix_offset_ns, origin=origin, sensor_file=file)
+
+
+class Clock:
+    """Clock that a test sets."""
+
+    now_ns = 10**12
+
+    def __call__(self) -> int:
+        return self.now_ns
 
 
 class ListSink(Sink):

@@ -6,13 +6,7 @@ import numpy as np
 from edge_samples import FakeModel, make_contract, save_graph, tiny_deviation, tiny_traction
 from onnx import helper
 
-from edge.inference.contract import (
-    DEVIATION_NAME,
-    INPUT_NAME,
-    OUTPUT_NAME,
-    POSES_NAME,
-    Contract,
-)
+from edge.inference.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, POSES_NAME, Contract
 
 WEIGHTS = np.array([0.5, 0.25, 0.0625, 2.0, 0.125], dtype=np.float32)
 """Weights of dx, dy, turn and the errors, all different, so that a number that is lost or exchanged shows."""

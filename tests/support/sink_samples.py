@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
+from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan, unpack
 from mcap_samples import messages_of
-from packed_messages import unpack
 
 from edge.perception.event import Event, Note
 from edge.perception.result import Result
@@ -22,6 +21,7 @@ from edge.sinks.ros2.map_messages import recorded_map
 from edge.sinks.ros2.messages import LOG, RESULT
 
 RUN = {"dropped": 2, "overruns": 1, "torn_wire": 3, "torn_source": 4}
+COUNTED = RUN | {"unwritten": 0}
 CONTRACT = make_contract(interval_factor=1.6)
 PERIOD_NS = 10_000_000
 SENSORS = ("4", "6", "7", "8")
@@ -134,7 +134,9 @@ class Jsonl(Opened):
         return [of_record(one, one["pattern"]) for one in self.lines() if one["state"] != "event"]
 
     def events(self) -> list[tuple[str, str]]:
-        return [(one["event"], one["note"]) for one in self.lines() if one["state"] == "event"]
+        events = [one for one in self.lines() if one["state"] == "event"]
+        assert all((one["sensor"], one["source"], one["counters"]) == (None, "emulated", COUNTED) for one in events)
+        return [(one["event"], one["note"]) for one in events]
 
 
 class Mcap(Opened):

@@ -38,9 +38,7 @@ def make_forward() -> ForwardModel:
     operator[0, 32:, : GRID**2] = cells / 4
     operator[0, :32, GRID**2 :] = KPA * np.eye(32)
     return ForwardModel(
-        operator=operator,
-        noise=np.full(3, 0.03125, dtype=np.float32),
-        model_error=np.full(3, 0.125, dtype=np.float32),
+        operator=operator, noise=np.full(3, 0.03125, dtype=np.float32), model_error=np.full(3, 0.125, dtype=np.float32)
     )
 
 

@@ -7,9 +7,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
-from edge_samples import FakeModel, fake_source, make_contract
+from edge_samples import FakeModel, fake_source, make_contract, unpack
 from map_samples import result_of
-from packed_messages import unpack
 from runtime_samples import Pushed, make_runtime
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect

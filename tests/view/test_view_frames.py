@@ -6,30 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edge_samples import PERIOD_NS, fake_source
-from packed_messages import unpack
+from edge_samples import PERIOD_NS, Clock, fake_source, unpack
 from view_samples import CONTRACT, Press
 
 from edge.perception.event import Event, Note
 from edge.sinks.json_records import event_record, record
-from edge.view.frames import (
-    EVENTS,
-    MAX_FPS,
-    RECENT_SCANS,
-    TRACE_POINTS,
-    TRACE_S,
-    Frames,
-    RunSnapshot,
-    Viewer,
-    hello,
-)
-
-
-class Clock:
-    now_ns = 10**12
-
-    def __call__(self):
-        return self.now_ns
+from edge.view.frames import EVENTS, MAX_FPS, RECENT_SCANS, TRACE_POINTS, TRACE_S, Frames, RunSnapshot, Viewer, hello
 
 
 @pytest.fixture

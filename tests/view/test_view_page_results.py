@@ -7,10 +7,10 @@ import threading
 from dataclasses import replace
 from io import BytesIO
 
-import browser_samples
+import browser_samples as web
 import numpy as np
 import pytest
-from browser_samples import RGBA, browser, colours_of, live, logged, number, open_page, part, playwright, word
+from browser_samples import browser, open_page
 from edge_samples import make_pad_contract, wait_for
 from map_samples import letter
 from matplotlib.image import imread
@@ -43,7 +43,7 @@ def drawn(page, x, y):
 
 
 def picture_of(page):
-    return imread(BytesIO(part(page, "field").screenshot()))[..., :3]
+    return imread(BytesIO(web.part(page, "field").screenshot()))[..., :3]
 
 
 def red_share(page):
@@ -58,11 +58,11 @@ def test_force_and_torque_are_told_and_drawn(open_page):
     shows = [made]
     with live_page(contract=contract) as shown, shown.playing(lambda: shows[0]):
         page = open_page(shown.view.url)
-        live(page)
+        web.live(page)
         newtons = made.force_counts / contract.nominal_counts_per_newton
-        playwright.expect(part(page, "force-now")).to_have_text(f"{newtons:.2f}\u202fN nominal")
+        web.expect(web.part(page, "force-now")).to_have_text(f"{newtons:.2f}\u202fN nominal")
         shows[0] = replace(made, force_n=3.0)
-        playwright.expect(part(page, "force-now")).to_have_text("3.00\u202fN")
+        web.expect(web.part(page, "force-now")).to_have_text("3.00\u202fN")
         for name, text in {
             "wrench_force": r"0\.30, 0\.00, 0\.40\sN",
             "wrench_torque": r"\u22120\.9, 0\.9\sN\smm",
@@ -70,7 +70,7 @@ def test_force_and_torque_are_told_and_drawn(open_page):
             "centre_of_pressure_mm": r"\u22122\.[34], \u22122\.[34]\smm",
             "wrench_origin": r"nominal \u00b1 45\s%",
         }.items():
-            playwright.expect(number(page, name)).to_have_text(re.compile(f"^{text}$"))
+            web.expect(web.number(page, name)).to_have_text(re.compile(f"^{text}$"))
         centre = CENTRE - PITCH
         assert drawn(page, centre + 0.1, centre), "the arrow of the shear, 0.24 of the width to the right"
         assert not drawn(page, centre - 0.1, centre) and not drawn(page, centre + 0.3, centre)
@@ -82,13 +82,13 @@ def test_the_pad_is_outlined_where_to_touch_next(open_page):
     shows = [idle]
     with live_page() as shown, shown.playing(lambda: shows[0]):
         page = open_page(shown.view.url)
-        next_tap, state = playwright.expect(number(page, "next_tap")), playwright.expect(part(page, "word"))
+        next_tap, state = web.expect(web.number(page, "next_tap")), web.expect(web.part(page, "word"))
         for result, text in ((idle, "idle"), (contact, "contact")):
             shows[0] = result
             state.to_have_text(text)
-        assert number(page, "wrench_force").count() == 0
-        playwright.expect(part(page, "verdict")).to_have_text("not checked: the model has no checks")
-        playwright.expect(number(page, "trusted")).to_have_text(re.compile("not checked|\u2013"))
+        assert web.number(page, "wrench_force").count() == 0
+        web.expect(web.part(page, "verdict")).to_have_text("not checked: the model has no checks")
+        web.expect(web.number(page, "trusted")).to_have_text(re.compile("not checked|\u2013"))
         shows[0] = idle
         state.to_have_text("idle")
         next_tap.to_have_text("\u2013")
@@ -122,33 +122,33 @@ def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page):
     contract = replace(CONTRACT, trust={"made": "of something"})
     with live_page(contract=contract) as shown, shown.playing(lambda: shows[0]):
         page = open_page(shown.view.url)
-        verdict, trusted = playwright.expect(part(page, "verdict")), playwright.expect(number(page, "trusted"))
-        live(page)
+        verdict, trusted = web.expect(web.part(page, "verdict")), web.expect(web.number(page, "trusted"))
+        web.live(page)
         trusted.to_have_text("yes")
-        playwright.expect(number(page, "mismatch")).to_have_text("2.1\u202f%")
+        web.expect(web.number(page, "mismatch")).to_have_text("2.1\u202f%")
         verdict.to_be_hidden()
         assert red_share(page) < 0.01
 
         shows[0] = unbelieved
-        word(page, "contact, not believed")
+        web.word(page, "contact, not believed")
         verdict.to_contain_text("not to be believed: readings like no contact (a magnet or steel near? the id map?")
-        playwright.expect(page.locator("#live")).to_have_text("sensor 4: contact, not believed")
+        web.expect(page.locator("#live")).to_have_text("sensor 4: contact, not believed")
         trusted.to_have_text("no: unfamiliar")
         for size in ((844, 390), (1280, 800)):
-            browser_samples.resize(page, *size)
+            web.resize(page, *size)
             verdict.to_be_in_viewport()
             wait_for(lambda: red_share(page) > 0.25)
 
         shows[0] = replace(contact, trusted=None)
         verdict.to_have_text("too light to check whether the pattern is to be believed")
         trusted.to_have_text("too light to check")
-        word(page, "contact")
+        web.word(page, "contact")
         assert red_share(page) < 0.01
 
         shows[0] = in_doubt
-        word(page, "baseline in doubt")
-        playwright.expect(part(page, "stamp")).to_have_text(f"{text} (key z)")
-        playwright.expect(part(page, "stamp")).to_be_visible()
+        web.word(page, "baseline in doubt")
+        web.expect(web.part(page, "stamp")).to_have_text(f"{text} (key z)")
+        web.expect(web.part(page, "stamp")).to_be_visible()
         verdict.to_be_hidden()
         trusted.to_have_text("no: baseline")
         assert np.ptp(picture_of(page), axis=2).max() < 0.1, "a colour"
@@ -156,13 +156,13 @@ def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page):
         forgotten = "the tap before does not belong to this contact, and is forgotten"
         tell(shown, "tap_dropped", "4", forgotten)
         tell(shown, "suspected", "4", "several contacts in a row read like none")
-        logged(page, f"sensor 4: {forgotten}")
+        web.logged(page, f"sensor 4: {forgotten}")
         suspected = re.compile("several contacts in a row read like none")
-        playwright.expect(page.locator("#log .bad")).to_have_text(suspected)
+        web.expect(page.locator("#log .bad")).to_have_text(suspected)
 
 
 def shown_on(page):
-    return colours_of(page.locator("#map-contact").evaluate(RGBA))
+    return web.colours_of(page.locator("#map-contact").evaluate(web.RGBA))
 
 
 def outline(page):
@@ -178,11 +178,11 @@ def test_a_map_grows_and_who_comes_late_misses_nothing(open_page):
     with live_page() as shown:
         mapped = Mapped(shown, letter)
         page = open_page(shown.view.url)
-        counts = playwright.expect(page.locator("#map-counts"))
-        playwright.expect(page.locator("#map")).to_be_hidden()
+        counts = web.expect(page.locator("#map-counts"))
+        web.expect(page.locator("#map")).to_be_hidden()
         shown.play()
         mapped.touch(-12.0, -8.0)
-        playwright.expect(page.locator("#map")).to_be_visible()
+        web.expect(page.locator("#map")).to_be_visible()
         mapped.touch(-12.0, 8.0)
         mapped.touch(2.0, 16.0)
         mapped.touch(20.0, -20.0, 30.0, trusted=False)
@@ -206,7 +206,7 @@ def test_a_map_grows_and_who_comes_late_misses_nothing(open_page):
         late = open_page(shown.view.url)
         layers = mapped.sink.whole.layers()
         for one in (page, late):
-            playwright.expect(one.locator("#map-counts")).to_contain_text("EMULATED: 6 patterns")
+            web.expect(one.locator("#map-counts")).to_contain_text("EMULATED: 6 patterns")
             there = shown_on(one)[..., 3] == 255
             assert np.array_equal(there, np.isfinite(layers.contact) | (layers.doubted > 0))
 
@@ -259,9 +259,9 @@ def proxy(port, *, below="/edge/", host=None, sockets=True):
     ("settings", "token", "query", "words"),
     [
         ({}, None, "", None),
-        ({"host": "edge_up"}, browser_samples.TOKEN, f"?token={browser_samples.TOKEN}", None),
+        ({"host": "edge_up"}, web.TOKEN, f"?token={web.TOKEN}", None),
         ({"host": "127.0.0.1:{port}"}, None, "", "may not send requests to this server"),
-        ({}, browser_samples.TOKEN, "", "the token is missing or wrong"),
+        ({}, web.TOKEN, "", "the token is missing or wrong"),
         ({"sockets": False}, None, "", "a proxy must send HTTP/1.1 with the headers Upgrade and Connection"),
         ({"sockets": None}, None, "", "answers 502 for /edge/ws, and not edge-sr"),
     ],
@@ -270,9 +270,9 @@ def test_behind_a_proxy_a_page_finds_its_socket_or_says_why_not(open_page, setti
     with live_page(token=token) as view, proxy(view.port, **settings) as url:
         page = open_page(url + query)
         if words is not None:
-            playwright.expect(page.locator("#trouble")).to_contain_text(words)
+            web.expect(page.locator("#trouble")).to_contain_text(words)
             return
-        playwright.expect(page.locator("#link")).to_have_attribute("data-up", "yes")
+        web.expect(page.locator("#link")).to_have_attribute("data-up", "yes")
         page.reload()
-        playwright.expect(page.locator("#link")).to_have_attribute("data-up", "yes")
+        web.expect(page.locator("#link")).to_have_attribute("data-up", "yes")
         page.close()  # before what it is connected to

@@ -3,47 +3,12 @@
 import json
 import os
 import re
-import struct
-import sys
 
+import browser_samples as web
 import numpy as np
 import pytest
-from browser_samples import (
-    PAINTED,
-    PHONE,
-    RGBA,
-    RUNS_OVER,
-    SIZES,
-    TOKEN,
-    browser,
-    colours_of,
-    demo,
-    emulated,
-    fits,
-    folder,
-    frames_of,
-    likeness,
-    live,
-    logged,
-    moves,
-    noise,
-    number,
-    open_page,
-    painted,
-    part,
-    playwright,
-    pressed,
-    resize,
-    shares,
-    then_held,
-    word,
-)
-from edge_samples import ROOT, wait_for
-
-from edge.terminal.progress_bar import progress
-
-sys.path.append(str(ROOT / "docs"))
-import live_pictures as pictures
+from browser_samples import browser, demo, folder, open_page
+from edge_samples import wait_for
 
 __all__ = ["browser", "demo", "folder", "open_page"]
 
@@ -76,15 +41,7 @@ WATCH_REFUSAL = """() => {
   const watch = { attributeFilter: ["hidden"], childList: true, subtree: true };
   new MutationObserver(() => window.refusals++).observe(document.querySelector("#refusal"), watch);
 }"""
-# The next frame already has every canvas in its new size, and painted.
-RESIZED = f"""async (canvas) => {{
-  const before = canvas.width;
-  canvas.closest(".sensor").style.width = "700px";
-  await new Promise((go_on) => requestAnimationFrame(() => setTimeout(go_on, 0)));
-  const resized = canvas.width !== before && ({PAINTED})(canvas) > 50;
-  canvas.closest(".sensor").style.width = "";
-  return resized;
-}}"""
+AS_SHOWN = "canvas => Math.abs(canvas.width - canvas.clientWidth * devicePixelRatio) < 2"
 INKED = """canvas => {
   const { data, width, height } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
   const ink = getComputedStyle(document.documentElement).getPropertyValue("--force").trim();
@@ -93,8 +50,6 @@ INKED = """canvas => {
   return Array.from({ length: width }, (_, x) =>
     Array.from({ length: height }, (_, y) => 4 * (y * width + x)).some(near));
 }"""
-BROKEN = "all => all.filter((one) => one.scrollHeight > 36 || one.scrollWidth > one.clientWidth + 1).length"
-SMALL = "all => all.filter((one) => one.offsetParent && one.getBoundingClientRect().height < 40).length"
 SIDES = """all => all.map(one => one.getBoundingClientRect())
   .map(({left, top, right, bottom}) => [left, top, right, bottom])"""
 
@@ -102,66 +57,65 @@ SIDES = """all => all.map(one => one.getBoundingClientRect())
 @pytest.fixture(scope="module")
 def held(demo, folder):
     """A run whose pad is pressed onto the demo's figure all the time, once it was seen free, and its pattern."""
-    counts, pattern = pressed(demo)
-    with emulated(folder, then_held(demo, counts)) as run:
+    counts, pattern = web.pressed(demo)
+    with web.emulated(folder, web.then_held(demo, counts)) as run:
         run.pattern = pattern
         yield run
 
 
-def test_a_held_pad_is_shown_and_measured(held, open_page, tmp_path):
+def test_a_held_pad_is_shown_and_measured(held, open_page):
     page = open_page(held.url)
-    live(page)
-    word(page, "contact")
+    web.live(page)
+    web.word(page, "contact")
 
     # The pattern, on its own scale.
-    scale = playwright.expect(part(page, "pattern-high"))
+    scale = web.expect(web.part(page, "pattern-high"))
     scale.to_contain_text("largest so far")
-    shown = shares(part(page, "pattern").evaluate(RGBA))
-    assert shown.shape == (40, 40) and shown.max() > 0.9 and likeness(shown, held.pattern) > 0.99
-    high_mm = float(part(page, "pattern-high").inner_text().partition("\u202f")[0])
+    shown = web.shares(web.part(page, "pattern").evaluate(web.RGBA))
+    assert shown.shape == (40, 40) and shown.max() > 0.9 and web.likeness(shown, held.pattern) > 0.99
+    high_mm = float(web.part(page, "pattern-high").inner_text().partition("\u202f")[0])
     assert np.sqrt(np.mean((high_mm * shown - held.pattern) ** 2)) < 0.01  # [mm]
-    heard = frames_of(page)
+    heard = web.frames_of(page)
     page.reload()
-    live(page)
+    web.live(page)
 
     # Maps, traces and numbers are there, and move.
-    moves(page)
+    web.moves(page)
     for name in ("interval_mm", "run_time_us", "latency_us", "rate_hz"):
-        playwright.expect(number(page, name)).to_contain_text(re.compile(r"[1-9]"))
-    playwright.expect(page.locator("#about")).to_contain_text("stsr-int8")
-    playwright.expect(number(page, "baseline_origin")).to_have_text("file")
+        web.expect(web.number(page, name)).to_contain_text(re.compile(r"[1-9]"))
+    web.expect(page.locator("#about")).to_contain_text("stsr-int8")
+    web.expect(web.number(page, "baseline_origin")).to_have_text("file")
     for name in ("shear", "force-plot", "area-plot", "over"):
-        assert part(page, name).evaluate(PAINTED) > 50, name
+        assert web.part(page, name).evaluate(web.PAINTED) > 50, name
     for name, shape in (("taxels", (4, 4)), ("deviation", (40, 40))):
-        rgba = colours_of(part(page, name).evaluate(RGBA))
+        rgba = web.colours_of(web.part(page, name).evaluate(web.RGBA))
         assert rgba.shape[:2] == shape and len(np.unique(rgba.reshape(-1, 4), axis=0)) > 5
-    assert part(page, "over").evaluate(RESIZED)
 
     # Shear is drawn in place of the area.
     wait_for(lambda: any(point[4] is not None for header in heard for point in header.get("trace", [])))
-    toggle = part(page, "shear_toggle")
+    toggle = web.part(page, "shear_toggle")
     for state in ("true", "false"):
         toggle.click()
-        playwright.expect(toggle).to_have_attribute("aria-pressed", state)
-        assert part(page, "area-plot").evaluate(PAINTED) > 50
+        web.expect(toggle).to_have_attribute("aria-pressed", state)
+        assert web.part(page, "area-plot").evaluate(web.PAINTED) > 50
 
     # The pointer reads a pixel, and numbers are explained.
-    part(page, "field").hover()
+    web.part(page, "field").hover()
     live_text = re.compile(r"x (\S+), y (\S+)\u202fmm: (\S+)\u202fmm \u00b1 (\S+)\u202fmm")
     # Shown with the next frame, which says "not live" or "no pattern" where this machine was busy.
-    x, y, value, doubt = wait_for(lambda: live_text.fullmatch(part(page, "readout").inner_text())).groups()
+    x, y, value, doubt = wait_for(lambda: live_text.fullmatch(web.part(page, "readout").inner_text())).groups()
     row, col = (round(float(one.replace("\u2212", "-")) / 0.47 + 19.5) for one in (y, x))  # of 40, 0.47 mm wide
     assert abs(float(value) - held.pattern[row, col]) < 0.05 and float(doubt) > 0
     page.mouse.move(5, 5)
-    playwright.expect(part(page, "readout")).to_contain_text("hover")
+    web.expect(web.part(page, "readout")).to_contain_text("hover")
     term = page.locator('[data-sensor="4"]').get_by_text("late", exact=True)
-    playwright.expect(term).to_have_attribute("title", re.compile("later than one scan period"))
+    web.expect(term).to_have_attribute("title", re.compile("later than one scan period"))
 
     # A keyboard is enough.
     page.keyboard.press("?")
-    playwright.expect(page.locator("#manual")).to_be_visible()
+    web.expect(page.locator("#manual")).to_be_visible()
     page.keyboard.press("Escape")
-    playwright.expect(page.locator("#manual")).to_be_hidden()
+    web.expect(page.locator("#manual")).to_be_hidden()
     page.locator("#zero").focus()
     reached = ["zero"]
     for _ in range(8):
@@ -173,29 +127,21 @@ def test_a_held_pad_is_shown_and_measured(held, open_page, tmp_path):
     assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
 
     # Nothing runs over on any screen, and a phone reads by touch.
-    for width, height in SIZES:
-        fits(page, width, height)
-        assert page.locator("dd.big").evaluate_all(BROKEN) == 0, width
-    fits(page, *PHONE)
-    field = part(page, "field").bounding_box()
+    for width, height in web.SIZES:
+        web.fits(page, width, height)
+    web.fits(page, *web.PHONE)
+    assert web.part(page, "force-plot").evaluate(AS_SHOWN) and web.part(page, "force-plot").evaluate(web.PAINTED) > 50
+    field = web.part(page, "field").bounding_box()
     assert field["width"] > 330 and field["y"] + field["height"] < page.locator("#keys").bounding_box()["y"]
 
-    phone = dict(zip(("width", "height"), PHONE, strict=True))
+    phone = dict(zip(("width", "height"), web.PHONE, strict=True))
     other = open_page(held.url, viewport=phone, has_touch=True, is_mobile=True)
-    playwright.expect(page.locator("#link")).to_have_text("connected, 2 viewers")
-    part(other, "readout").filter(has_text="tap the pattern").wait_for()
-    box = part(other, "field").bounding_box()
+    web.expect(page.locator("#link")).to_have_text("connected, 2 viewers")
+    web.part(other, "readout").filter(has_text="tap the pattern").wait_for()
+    box = web.part(other, "field").bounding_box()
     other.touchscreen.tap(box["x"] + box["width"] / 4, box["y"] + box["height"] / 4)
-    playwright.expect(part(other, "readout")).to_have_text(re.compile("^x \u22124\\.\\d, y \u22124\\.\\d\\smm"))
-    assert other.locator("#keys button").evaluate_all(SMALL) == 0
-    assert other.evaluate(RUNS_OVER) == 0
-
-    # The pictures of the pages can still be taken.
-    assert pictures.held_demo().shape[1:] == pictures.magnet_near().shape[1:] == (3, 4, 4)
-    pictures.PICTURES = tmp_path
-    pictures.keep(page, "phone", progress("pictures", 1, "picture"))
-    taken = (tmp_path / "live-phone.png").read_bytes()
-    assert taken.startswith(b"\x89PNG") and struct.unpack(">II", taken[16:24]) == pictures.PHONE
+    web.expect(web.part(other, "readout")).to_have_text(re.compile("^x \u22124\\.\\d, y \u22124\\.\\d\\smm"))
+    assert other.evaluate(web.RUNS_OVER) == 0
 
 
 NODES_SHOWN = "let all = document.createNodeIterator(document), count = 0; while (all.nextNode()) count += 1; count"
@@ -205,22 +151,22 @@ def test_reconnects_lose_and_repeat_nothing(held, open_page):
     page, other = open_page(held.url, script=WATCH_SOCKETS), open_page(held.url)
 
     # After a reconnect nothing is told twice.
-    live(page)
-    live(other)
+    web.live(page)
+    web.live(other)
     for times in (1, 2):
         other.keyboard.press("z")
         wait_for(lambda times=times: page.evaluate(TOLD, "zeroing refused") == times)
-    playwright.expect(page.locator("#refusal")).to_be_hidden()
+    web.expect(page.locator("#refusal")).to_be_hidden()
     page.evaluate(WATCH_REFUSAL)
     page.evaluate(RECONNECT, 1)
     other.keyboard.press("r")
-    logged(page, "earlier taps forgotten")  # after all that a newcomer is sent
+    web.logged(page, "earlier taps forgotten")  # after all that a newcomer is sent
     assert page.evaluate(TOLD, "zeroing refused") == 2 and page.evaluate("refusals") == 0
 
     # A held pad draws a line: what was missed meanwhile leaves no hole of 0.7 s in it, nor in the other page's.
-    live(page)
-    here, there = (max(np.diff(np.flatnonzero(part(one, "force-plot").evaluate(INKED)))) for one in (page, other))
-    assert here < there + 0.07 * part(page, "force-plot").evaluate("canvas => canvas.width")
+    web.live(page)
+    here, there = (max(np.diff(np.flatnonzero(web.part(one, "force-plot").evaluate(INKED)))) for one in (page, other))
+    assert here < there + 0.07 * web.part(page, "force-plot").evaluate("canvas => canvas.width")
 
     # Many reconnects leave nothing.
     devtools = page.context.new_cdp_session(page)
@@ -238,23 +184,23 @@ def test_reconnects_lose_and_repeat_nothing(held, open_page):
     def open_files():
         return len(os.listdir(f"/proc/{held.pid}/fd"))  # noqa: PTH208
 
-    resize(page, 390, 300)
+    web.resize(page, 390, 300)
     page.evaluate(RECONNECT, FIRST_RECONNECTS)
     before, files = kept(), open_files()
     page.evaluate(RECONNECT, RECONNECTS)
-    live(page)
+    web.live(page)
     after = kept()
     page.wait_for_function("gc(), sockets.filter((one) => one.deref() !== undefined).length <= 2")
     assert after["JSEventListeners"] <= before["JSEventListeners"] + 5
     assert after["Nodes"] <= before["Nodes"] + RECONNECTS / 2
     assert after["JSHeapUsedSize"] < before["JSHeapUsedSize"] + 500_000
     wait_for(lambda: open_files() <= files + 2)
-    logged(page, "connected again")
+    web.logged(page, "connected again")
 
 
 def zero(page, sensor, ask):
     """Ask, and again where a busy machine left the sensor silent meanwhile, until there is a new baseline."""
-    baseline = number(page, "baseline", sensor)
+    baseline = web.number(page, "baseline", sensor)
     before = baseline.inner_text()
     while baseline.inner_text() == before:
         given_up = page.evaluate(TOLD, "given up")
@@ -263,38 +209,38 @@ def zero(page, sensor, ask):
 
 
 def test_two_sensors_are_zeroed_forced_and_lost(demo, folder, open_page):
-    tracks = then_held(demo, pressed(demo)[0]), demo["counts"][:1] + noise(200, seed=2)
-    with emulated(folder, *tracks, options=["--view-token", TOKEN]) as run:
-        assert TOKEN in run.url
+    tracks = web.then_held(demo, web.pressed(demo)[0]), demo["counts"][:1] + web.noise(200, seed=2)
+    with web.emulated(folder, *tracks, options=["--view-token", web.TOKEN]) as run:
+        assert web.TOKEN in run.url
         page, other = open_page(run.url), open_page(run.url)
         assert page.url == run.url.partition("?")[0], "a token is not left in the address"
         sent = []
         page.on("websocket", lambda socket: socket.on("framesent", lambda text: sent.append(json.loads(text))))
         page.reload()
         for one in (page, other):
-            live(one)
-            word(one, "idle", "6")
+            web.live(one)
+            web.word(one, "idle", "6")
         (left, top, right, _), (other_left, other_top, *_) = page.eval_on_selector_all(".sensor", SIDES)
         assert top == other_top and right < other_left
 
         # Each is zeroed by its button; where it is in contact this is refused, and offered to who asked alone.
-        stored = number(page, "baseline").inner_text()
-        playwright.expect(page.locator("#force")).to_be_hidden()
+        stored = web.number(page, "baseline").inner_text()
+        web.expect(page.locator("#force")).to_be_hidden()
         page.keyboard.press("Shift+Z")  # nothing was refused yet
-        zero(page, "6", part(page, "zero", "6").click)
-        playwright.expect(number(page, "baseline_origin", "6")).to_have_text("on demand")
+        zero(page, "6", web.part(page, "zero", "6").click)
+        web.expect(web.number(page, "baseline_origin", "6")).to_have_text("on demand")
         assert sent[0] == {"cmd": "zero", "sensor": "6"}
         del sent[:]
-        part(other, "zero").click()
-        playwright.expect(other.locator("#force")).to_be_visible()
-        logged(page, "zeroing refused")
-        playwright.expect(page.locator("#refusal")).to_contain_text("sensor 4 is in contact")
-        playwright.expect(page.locator("#force")).to_be_hidden()
+        web.part(other, "zero").click()
+        web.expect(other.locator("#force")).to_be_visible()
+        web.logged(page, "zeroing refused")
+        web.expect(page.locator("#refusal")).to_contain_text("sensor 4 is in contact")
+        web.expect(page.locator("#force")).to_be_hidden()
         page.keyboard.press("Shift+Z")
         page.keyboard.press("z")
-        playwright.expect(page.locator("#force")).to_be_visible()
-        playwright.expect(page.locator("#refusal")).not_to_contain_text("sensor 6")
-        assert number(page, "baseline").inner_text() == stored
+        web.expect(page.locator("#force")).to_be_visible()
+        web.expect(page.locator("#refusal")).not_to_contain_text("sensor 6")
+        assert web.number(page, "baseline").inner_text() == stored
 
         def force():
             if len(sent) < 2:
@@ -305,30 +251,30 @@ def test_two_sensors_are_zeroed_forced_and_lost(demo, folder, open_page):
                 page.locator("#force").click()
 
         zero(page, "4", force)
-        playwright.expect(other.locator("#refusal")).to_be_hidden()
-        playwright.expect(page.locator("#refusal")).to_be_hidden()
-        playwright.expect(number(page, "baseline_origin")).to_have_text("on demand")
-        word(page, "idle")
+        web.expect(other.locator("#refusal")).to_be_hidden()
+        web.expect(page.locator("#refusal")).to_be_hidden()
+        web.expect(web.number(page, "baseline_origin")).to_have_text("on demand")
+        web.word(page, "idle")
         assert sent[:2] == [{"cmd": "zero"}, {"cmd": "zero", "sensor": "4", "force": True}]
         del sent[:]
         page.keyboard.press("Shift+Z")  # once
         page.keyboard.press("r")
-        logged(other, "earlier taps forgotten")
-        painted(page)  # after all that it has sent is known here
+        web.logged(other, "earlier taps forgotten")
+        web.painted(page)  # after all that it has sent is known here
         assert sent == [{"cmd": "reset"}]
 
-        playwright.expect(part(page, "field")).to_have_class("field old")
-        playwright.expect(part(page, "stamp")).to_contain_text("last contact")
+        web.expect(web.part(page, "field")).to_have_class("field old")
+        web.expect(web.part(page, "stamp")).to_contain_text("last contact")
 
         # On a phone one is below the other; both are silent without their cable.
-        resize(page, *PHONE)
+        web.resize(page, *web.PHONE)
         (left, _, _, bottom), (other_left, other_top, *_) = page.eval_on_selector_all(".sensor", SIDES)
         assert left == other_left and bottom < other_top
         run.emulator.hang_up()
         for sensor in "46":
-            word(page, "no scan for", sensor)
-            playwright.expect(part(page, "link", sensor)).to_contain_text("no scan for")
-            playwright.expect(part(page, "field", sensor)).to_have_attribute("data-live", "no")
-        playwright.expect(page.locator("#link")).to_contain_text("; no scan from ")
-        playwright.expect(page.locator("#link")).to_have_attribute("data-up", "part")
-        logged(page, "link lost")
+            web.word(page, "no scan for", sensor)
+            web.expect(web.part(page, "link", sensor)).to_contain_text("no scan for")
+            web.expect(web.part(page, "field", sensor)).to_have_attribute("data-live", "no")
+        web.expect(page.locator("#link")).to_contain_text("; no scan from ")
+        web.expect(page.locator("#link")).to_have_attribute("data-up", "part")
+        web.logged(page, "link lost")
