@@ -128,21 +128,6 @@ def test_half_of_the_windows_of_one_tap_are_mirror_images(presses):
         assert np.abs(found - expected)[unknown].max() <= within, name
 
 
-def test_windows_of_one_tap_come_from_presses_of_one(presses):
-    """Sixteen of 64 presses have two taps: a quarter of a batch is of the other 48, and all the rest has both."""
-    counts = presses.counts.copy()
-    counts[16:, 1] = 0
-    mixed = replace(presses, counts=counts)
-    batches = PressBatches(mixed, (0.25, 0.75), 16, seed=3, nuisances=QUIET)
-    for number in range(4):
-        older = batches(number).window[:, 3:].abs().amax(dim=(1, 2, 3)).numpy()
-        assert (older == 0).tolist() == [True] * 4 + [False] * 12
-    marks = [row.tobytes() for row in presses.traction_kpa[:, 0, 0].astype(np.float32)]
-    drawn = np.array([[marks.index(row.tobytes()) for row in batches(n).traction.numpy()[:, 0, 0]] for n in range(12)])
-    assert sorted(drawn[:, :4].ravel()) == list(range(16, 64)), "each once in an epoch"
-    assert drawn[:, 4:].max() < 16
-
-
 def test_gains_of_frozen_presses_divide_out(presses):
     frozen = freeze_presses(presses, 9, GAINS_ALONE)
     raw, evened = frozen.windows(2), frozen.windows(2, gains_known=True)
