@@ -11,7 +11,7 @@ COLUMNS = {
     "table3": [ERRORS | {"method", "validation PSNR dB", "test SSIM", "parameters", "MMAC"}],
     "table4": [ERRORS | {"scale", "paper's test PSNR dB", "MMAC"}],
     "angle": [ERRORS | {"network", "angle deg", "over STSR dB"}],
-    "unseen": [ERRORS | {"trained on", "tested on", "taps", "covered %", "width %", "steps"}],
+    "unseen": [ERRORS | {"trained on", "tested on", "taps", "steps"}],
     "families": [{"method", "run time us"}, {"family", "model, over"}, {"edge", "far"}],
     "pads": [{"constant", "model, down", "model, all known, up"}],
     "posed-taps": [

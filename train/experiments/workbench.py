@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from timeit import repeat
 from typing import Final, NamedTuple
@@ -42,18 +42,18 @@ Figures = dict[str, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Method:
-    """Method from windows (n, taps, 3, rows, cols) in zeroed counts to patterns and deviations, (n, H, W) in [mm]."""
+    """Method from windows (n, taps, 3, rows, cols) in zeroed counts to patterns, (n, H, W) in [mm]."""
 
     name: str
     taps: int  # of a window that the method uses
     contact_level: float  # share of a pattern's maximum from which a pixel counts as touched
-    run: Callable[[NDArray[np.float32]], tuple[NDArray[np.floating], NDArray[np.float32] | None]]
+    run: Callable[[NDArray[np.float32]], NDArray[np.floating]]
     cost: Row = field(default_factory=dict)  # parameters, multiply-accumulates and run time, as cells of a row
     training: Row = field(default_factory=dict)  # steps and time, as cells of a row
 
     def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
         """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
-        return self.run(windows[:, : self.taps])[0]
+        return self.run(windows[:, : self.taps])
 
 
 @dataclass
@@ -106,7 +106,9 @@ class Workbench:
             _, report = load_network(self.checkpoints / f"{start}.pt")
             steps, elapsed_s = steps + report["steps"], elapsed_s + report["elapsed_s"]
         cells: Row = {"steps": steps, "training min": round(elapsed_s / 60, 1)}
-        return Method(path.stem, net.taps, level, partial(infer_network, net), _cost_of_network(net), cells)
+        return Method(
+            path.stem, net.taps, level, lambda given: infer_network(net, given)[0], _cost_of_network(net), cells
+        )
 
     def frozen(
         self,
