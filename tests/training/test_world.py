@@ -155,24 +155,18 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     ("options", "told"),
     [
         (["--count", "0"], "count is 0, expected 1 or more"),
-        (["--taps", "0"], "taps is 0"),
         (["--taps", "8"], "taps is 8, expected 1 to 7"),
-        (["--per-pad", "0"], "per_pad is 0"),
         (["--seed", "-1"], "seed is -1"),
-        (["--spread", "1.5"], "spread is 1.5, expected 0 to 1"),
         (["--spread", "nan"], "spread is nan"),
-        (["--begun", "1.5"], "begun is 1.5, expected 0 to 1"),
         (["--families", "dome,sphere"], "no family 'sphere': expected some of paper, "),
         (["--families", "none"], "no family named: expected some of"),
         (["--schedule", "spiral"], "no schedule .spiral.: expected one of turns, half-pitch"),
         (["--mesh", "absent.stl"], "cannot be read: No such file"),
-        (["--mesh", "ball.stl", "--mesh-share", "0"], "is 0.0, expected more than 0"),
         (["--families", "none", "--mesh", "ring.stl"], r"ring\.stl' lies under the pad"),
     ],
 )
 def test_what_cannot_be_made_is_said_in_one_line(tmp_path, monkeypatch, options, told):
     monkeypatch.chdir(tmp_path)
-    trimesh.creation.icosphere(radius=20.0).export("ball.stl")
     trimesh.creation.annulus(r_min=28.0, r_max=30.0, height=3.0).export("ring.stl")
     with pytest.raises(SystemExit, match=rf"^train\.data\.make_presses: .*{told}[^\n]*$"):
         main(["out.npz", "--count", "2", *options])
