@@ -39,7 +39,7 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file, with_scale
 from train.data.frozen_presses import FrozenPresses, freeze_presses
-from train.data.make_presses import make_presses, quiet_workers
+from train.data.make_presses import make_presses
 from train.data.press_batches import OneSensor
 from train.data.presses import SEED, PressSet
 from train.data.real_grips import Grip, grips_of, has_hole, play
@@ -320,12 +320,10 @@ def trained(
         "figures": replace(even, families=dict.fromkeys(FIGURES, 1.0)),
         UNLIKE: replace(even, ranges=knowledge.widened()),
     }
-    made = {}
-    with quiet_workers():
-        presses = make_presses(replace(world, count=plan.presses), work / "presses.npz")
-        for number, (what, of) in enumerate(sets.items(), 1):
-            path = work / f"{what.replace(' ', '-')}.npz"
-            made[what] = make_presses(replace(of, seed=world.seed + 1000 * number), path)
+    made, presses = {}, make_presses(replace(world, count=plan.presses), work / "presses.npz")
+    for number, (what, of) in enumerate(sets.items(), 1):
+        path = work / f"{what.replace(' ', '-')}.npz"
+        made[what] = make_presses(replace(of, seed=world.seed + 1000 * number), path)
     sensor = knowledge.sensor()
     frozen = freeze_presses(made["validation"], SEED, sensor.nuisances).as_frozen_set()
     report = fit_network(_training(name, sensor, plan.steps), presses, frozen, work, taps)

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -20,7 +19,7 @@ from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
-from train.data.make_presses import make_presses, quiet_workers
+from train.data.make_presses import make_presses
 from train.data.presses import PressSet, one_thread
 from train.data.world import World
 from train.freeze import freeze
@@ -77,9 +76,7 @@ class Workbench:
             name = f"quick-{name}"
             world = replace(world, count=_QUICK_PRESSES, taps=quick_taps, per_pad=_QUICK_PRESSES // 2)
         self.data_folder.mkdir(parents=True, exist_ok=True)
-        path = self.data_folder / f"{name}.npz"
-        with nullcontext() if path.exists() else quiet_workers():
-            return make_presses(world, path)
+        return make_presses(world, self.data_folder / f"{name}.npz")
 
     def model(self, name: str = DEFAULT_MODEL) -> ModelSession:
         """Return a shipped model, in the session of the runtime."""
