@@ -44,7 +44,7 @@ models: $(VENV)/.dev $(PRESSES) $(TURNED) $(FIGURES) data/validation.npz  ## tra
 
 REPORT := nice $(BIN)/python
 
-reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each command stands alone, too
+reports: $(VENV)/.dev  ## every report: days on two cores; each command stands alone, too
 	$(REPORT) -m train.experiments all
 	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md
 	$(BIN)/edge-sr bench --out reports
@@ -79,12 +79,6 @@ data/nominal7.npz: $(VENV)/.dev  ## the same, seven taps each
 
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 2520 --per-pad 10 --taps 7 --seed 1000001
-
-data/test.npz: $(VENV)/.dev  ## the same on yet other pads, by which nothing is set
-	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --schedule turns --begun 0 --seed 2000001
-
-train/data/wide-test.npz: | data/test.npz  ## the wide test set, read once by sensors of its own
-	$(BIN)/python -m train.data.frozen_presses data/test.npz $@
 
 $(VENV)/.runtime: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

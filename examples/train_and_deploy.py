@@ -30,13 +30,13 @@ from edge.terminal.argument_types import positive
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import freeze_presses
-from train.data.make_presses import make_presses, quiet_workers
+from train.data.make_presses import make_presses
 from train.data.presses import SEED
 from train.data.world import World
 from train.errors import ended_by_errors
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
-from train.own import REPLACED, Knowledge, compared, plan_of
+from train.own import Knowledge, compared, plan_of
 from train.physics.pad_draws import KNOWN, RANGES
 from train.surfaces.meshes import mesh_name, size_of
 
@@ -50,17 +50,16 @@ def train(mesh: Path, out: Path, *, minutes: float, figures: float, seed: int) -
     work.mkdir(parents=True, exist_ok=True)
     print(size_of(surface), flush=True)
     handed = out / f"{name}.onnx"
-    before = {REPLACED: load_model(handed)} if handed.exists() else {}
+    before = load_model(handed) if handed.exists() else None
     shares = {surface: 1 - figures, "glyph": figures / 2, "polygon": figures / 2}
     world = World(families={family: share for family, share in shares.items() if share}, seed=seed)
     plan = plan_of(minutes, world, work)
     unseen = World(families={surface: 1.0}, count=UNSEEN, per_pad=6)
-    with quiet_workers():
-        presses = make_presses(replace(world, count=plan.presses), work / "presses.npz")
-        validation, test = (
-            make_presses(replace(unseen, seed=seed + more), work / f"{what}.npz")
-            for what, more in (("validation", 1000), ("test", 2000))
-        )
+    presses = make_presses(replace(world, count=plan.presses), work / "presses.npz")
+    validation, test = (
+        make_presses(replace(unseen, seed=seed + more), work / f"{what}.npz")
+        for what, more in (("validation", 1000), ("test", 2000))
+    )
     recipe = Recipe(plan.steps, bf16=True)
     training = Training(name, "compact-stsr", recipe, options={"known": KNOWN}, seed=seed)
     fit_network(training, presses, freeze_presses(validation, SEED).as_frozen_set(), work)

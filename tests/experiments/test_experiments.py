@@ -11,8 +11,7 @@ COLUMNS = {
     "table3": [ERRORS | {"method", "validation PSNR dB", "test SSIM", "parameters", "MMAC"}],
     "table4": [ERRORS | {"scale", "paper's test PSNR dB", "MMAC"}],
     "angle": [ERRORS | {"network", "angle deg", "over STSR dB"}],
-    "taps": [ERRORS | {"network", "taps given", "over STSR dB"}],
-    "unseen": [ERRORS | {"trained on", "tested on", "taps", "covered %", "width %", "steps"}],
+    "unseen": [ERRORS | {"trained on", "tested on", "taps", "steps"}],
     "families": [{"method", "run time us"}, {"family", "model, over"}, {"edge", "far"}],
     "pads": [{"constant", "model, down", "model, all known, up"}],
     "posed-taps": [
@@ -20,7 +19,6 @@ COLUMNS = {
         {"off mm", "over one tap, not stated", "left out %, stated"},
         {"model", "over one tap"},
     ],
-    "nonnegative": [{"world", "known", "over one tap", "run time us"}],
     "second-world": [{"method", "sinking, PSNR dB", "as drawn, wrong %"}, {"truth"}, {"sensor, after 10 %"}],
     "blind-sensors": [{"patterns", "figures, over"}, {"sensor", "its own, all", "all families", "handed over"}],
     "fig7": [{"method", "error %", "ms a pattern"}],

@@ -10,7 +10,7 @@ from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.recording.formats import load_recording
 from train.data.world import World, solve_pad
 from train.demo import demo_recording
-from train.freeze import KINDS, drawn, fit_classical, fit_kinds, fit_taxels, freeze, main
+from train.freeze import KINDS, fit_classical, fit_kinds, fit_taxels, freeze, main
 from train.surfaces.named_surfaces import SURFACES
 
 
@@ -92,16 +92,6 @@ def test_kinds_of_contact_are_separated_at_any_scale():
 def presses():
     figures = dict.fromkeys(SURFACES[:2], 1.0)
     return solve_pad(World(count=64, per_pad=64, families=figures, spread=0.0, seed=9), 0)
-
-
-def test_every_press_is_drawn_as_often_with_its_own_truth(presses):
-    newest, patterns = drawn(presses, windows=2 * len(presses))
-    marks = [pattern.tobytes() for pattern in presses.patterns.astype(np.float32)]
-    index = [marks.index(pattern.tobytes()) for pattern in patterns]
-    assert np.bincount(index).tolist() == [2] * len(presses)
-    clean = presses.counts[index, 0].reshape(len(index), -1)
-    alike = [np.corrcoef(*pair)[0, 1] for pair in zip(newest.reshape(len(index), -1), clean, strict=True)]
-    assert np.median(alike) > 0.95
 
 
 def test_taxels_covary_as_their_readings_do(presses):

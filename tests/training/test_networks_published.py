@@ -1,5 +1,3 @@
-import copy
-
 import pytest
 import torch
 from torch import nn
@@ -113,18 +111,6 @@ def test_the_penalty_is_that_of_a_linear_critic():
     false, true = patterns(seed=1), patterns(seed=2)
     expected = 0.5 * (false - true).sum(dim=(1, 2)).mean() + 10 * (4.0 - 1) ** 2
     assert torch.allclose(objective.critic_loss(false, true), expected, rtol=1e-4)
-
-
-def test_network_and_critic_keep_out_of_each_others_weights():
-    objective, net = SrganObjective(), Plain()
-    critic = copy.deepcopy(objective.critic.state_dict())
-    objective.loss(net, Batch(torch.zeros(6, 3, 4, 4), patterns())).backward()
-    assert net.value.grad is not None
-    assert all(p.grad is None for p in objective.critic.parameters())
-    gradient = net.value.grad.clone()
-    objective.after_step()
-    assert torch.equal(net.value.grad, gradient)
-    assert not all(torch.equal(value, critic[name]) for name, value in objective.critic.state_dict().items())
 
 
 def test_a_run_cut_short_goes_on_as_if_it_were_not(tmp_path):

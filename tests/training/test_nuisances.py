@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from edge_samples import make_pad_contract
 
-from edge.perception.contact_options import ON_COUNTS
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.scans.pad_constants import Pad as KnownPad
 from train.physics.pad_draws import INPUTS, KNOWN, RANGES, Pad, constants, draw_pad, input_scale, known_numbers
@@ -60,10 +58,6 @@ def test_all_off_only_rounds_and_leaves_its_input_alone():
     assert np.array_equal(clean, kept)
     assert readings.dtype == np.float32
     assert np.array_equal(readings, np.rint(readings))
-
-
-def test_a_drift_of_two_deviations_is_no_contact():
-    assert 2 * Nuisances().thermal_drift_counts < ON_COUNTS / USPA44.taxel_count
 
 
 def maxwell(readings, time_s, share, relaxation_s):

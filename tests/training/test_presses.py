@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from press_samples import make_press_set
 
-from train.data.frozen_presses import freeze_presses, load_frozen_presses, main
+from train.data.frozen_presses import freeze_presses, load_frozen_presses
 from train.data.press_batches import COUNTS_PER_UNIT, PressBatches
 from train.data.presses import join_presses, load_presses
 from train.errors import DatasetError
@@ -21,17 +21,16 @@ def arrays_of(presses):
     return {name: getattr(presses, name) for name in ("family", "pad", "counts", "patterns", "touching", "twist_nmm")}
 
 
-@pytest.mark.parametrize("compressed", [False, True])
-def test_what_is_saved_is_read_back_to_the_bit(tmp_path, compressed):
+def test_what_is_saved_is_read_back_to_the_bit(tmp_path):
     made = make_press_set()
-    made.save(tmp_path / "deep" / "presses.npz", compressed=compressed)
+    made.save(tmp_path / "deep" / "presses.npz")
     read = load_presses(tmp_path / "deep" / "presses.npz")
     assert read.sha256() == made.sha256() and read.config == made.config
     for name, array in arrays_of(made).items():
         assert getattr(read, name).dtype == array.dtype and np.array_equal(getattr(read, name), array), name
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["presses.npz"]
     content = (tmp_path / "deep" / "presses.npz").read_bytes()
-    made.save(tmp_path / "again.npz", compressed=compressed)
+    made.save(tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == content
 
 
@@ -128,21 +127,6 @@ def test_half_of_the_windows_of_one_tap_are_mirror_images(presses):
         assert np.abs(found - expected)[unknown].max() <= within, name
 
 
-def test_windows_of_one_tap_come_from_presses_of_one(presses):
-    """Sixteen of 64 presses have two taps: a quarter of a batch is of the other 48, and all the rest has both."""
-    counts = presses.counts.copy()
-    counts[16:, 1] = 0
-    mixed = replace(presses, counts=counts)
-    batches = PressBatches(mixed, (0.25, 0.75), 16, seed=3, nuisances=QUIET)
-    for number in range(4):
-        older = batches(number).window[:, 3:].abs().amax(dim=(1, 2, 3)).numpy()
-        assert (older == 0).tolist() == [True] * 4 + [False] * 12
-    marks = [row.tobytes() for row in presses.traction_kpa[:, 0, 0].astype(np.float32)]
-    drawn = np.array([[marks.index(row.tobytes()) for row in batches(n).traction.numpy()[:, 0, 0]] for n in range(12)])
-    assert sorted(drawn[:, :4].ravel()) == list(range(16, 64)), "each once in an epoch"
-    assert drawn[:, 4:].max() < 16
-
-
 def test_gains_of_frozen_presses_divide_out(presses):
     frozen = freeze_presses(presses, 9, GAINS_ALONE)
     raw, evened = frozen.windows(2), frozen.windows(2, gains_known=True)
@@ -172,11 +156,3 @@ def test_the_wide_set_is_the_one_that_figures_are_of(wide):
     assert not x_mm.any() and not y_mm.any() and np.allclose(np.median(turn_deg, axis=0), (0, 5, 10, 15))
     moved = replace(wide.presses, poses=wide.presses.poses + np.float32([0.1, 0, 0]))
     assert moved.sha256() != WIDE_SHA256
-
-
-def test_it_is_written_by_one_command(tmp_path, capsys):
-    make_press_set(6).save(tmp_path / "presses.npz")
-    main([str(tmp_path / "presses.npz"), str(tmp_path / "frozen.npz")])
-    assert load_frozen_presses(tmp_path / "frozen.npz").presses.sha256() in capsys.readouterr().out
-    with pytest.raises(SystemExit, match=r"^frozen_presses: .*no such file"):
-        main([str(tmp_path / "absent.npz"), str(tmp_path / "frozen.npz")])

@@ -16,7 +16,7 @@ from train.data.frozen_presses import freeze_presses
 from train.data.press_batches import Batch
 from train.data.presses import SEED
 from train.errors import CheckpointError, DatasetError
-from train.fit import bundled, given_taps, main
+from train.fit import bundled, main
 from train.learning.checkpoint import Training, fit_network, infer, load_network
 from train.learning.interval_fit import interval_coverage
 from train.learning.training_loop import DivergedError, Recipe, learning_rate_share, train
@@ -112,12 +112,6 @@ def test_a_training_begins_with_the_weights_of_another(folder, data, validation,
     fit_network(replace(TRAINING, name="further", start="small", recipe=recipe), data, validation, tmp_path)
     first, further = (torch.load(tmp_path / f"{name}.pt", weights_only=True) for name in ("small", "further"))
     assert all(torch.allclose(first[name], further[name]) for name in first if name != "deviation_scale")
-
-
-@pytest.mark.parametrize("taps", range(1, 8))
-def test_windows_of_every_number_of_taps_are_drawn(taps):
-    shares = given_taps(taps)
-    assert len(shares) == taps and sum(shares) == pytest.approx(1) and min(shares) > 0
 
 
 def test_the_bundled_networks_need_presses_of_seven_taps(data):

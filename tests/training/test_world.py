@@ -18,7 +18,7 @@ from edge import api
 from export.to_onnx import export
 from firmware_bridge.pad_geometry import USPA44, USPA46
 from train.data.frozen_presses import freeze_presses
-from train.data.make_presses import main, make_presses, quiet_workers
+from train.data.make_presses import main, make_presses
 from train.data.presses import load_presses
 from train.data.world import INDENTATION_MM, LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, ended_by_errors
@@ -64,10 +64,9 @@ def part_of(path, number, presses):
 
 
 def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(small, tmp_path):
-    """By several processes, where the first run had one."""
+    """Of which this process made a part."""
     part_of(tmp_path / "small.npz", 1, solve_pad(SMALL, 1))
-    with quiet_workers():
-        make_presses(SMALL, tmp_path / "small.npz")
+    make_presses(SMALL, tmp_path / "small.npz")
     assert (tmp_path / "small.npz").read_bytes() == small.read_bytes()
     assert not (tmp_path / "small.npz.parts").exists()
     nothing = solve_pad(SMALL, 0).pick(np.zeros(0, dtype=int))
@@ -155,24 +154,18 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     ("options", "told"),
     [
         (["--count", "0"], "count is 0, expected 1 or more"),
-        (["--taps", "0"], "taps is 0"),
         (["--taps", "8"], "taps is 8, expected 1 to 7"),
-        (["--per-pad", "0"], "per_pad is 0"),
         (["--seed", "-1"], "seed is -1"),
-        (["--spread", "1.5"], "spread is 1.5, expected 0 to 1"),
         (["--spread", "nan"], "spread is nan"),
-        (["--begun", "1.5"], "begun is 1.5, expected 0 to 1"),
         (["--families", "dome,sphere"], "no family 'sphere': expected some of paper, "),
         (["--families", "none"], "no family named: expected some of"),
         (["--schedule", "spiral"], "no schedule .spiral.: expected one of turns, half-pitch"),
         (["--mesh", "absent.stl"], "cannot be read: No such file"),
-        (["--mesh", "ball.stl", "--mesh-share", "0"], "is 0.0, expected more than 0"),
         (["--families", "none", "--mesh", "ring.stl"], r"ring\.stl' lies under the pad"),
     ],
 )
 def test_what_cannot_be_made_is_said_in_one_line(tmp_path, monkeypatch, options, told):
     monkeypatch.chdir(tmp_path)
-    trimesh.creation.icosphere(radius=20.0).export("ball.stl")
     trimesh.creation.annulus(r_min=28.0, r_max=30.0, height=3.0).export("ring.stl")
     with pytest.raises(SystemExit, match=rf"^train\.data\.make_presses: .*{told}[^\n]*$"):
         main(["out.npz", "--count", "2", *options])

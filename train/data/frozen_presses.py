@@ -1,10 +1,5 @@
-"""Presses as sensors with gains of their own have read them: a set to evaluate on, never to learn from.
+"""Presses as sensors with gains of their own have read them: a set to evaluate on, never to learn from."""
 
-python -m train.data.frozen_presses data/test.npz train/data/wide-test.npz
-"""
-
-import argparse
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -15,14 +10,13 @@ from numpy.typing import NDArray
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.press_batches import read_presses
-from train.data.presses import SEED, PressSet, load_presses
-from train.errors import ended_by_errors
+from train.data.presses import PressSet, load_presses
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.pad_draws import input_scale, known_numbers
 from train.physics.sensor_noise import NAMES, Nuisances
 
 WIDE_TEST: Final = Path(__file__).with_name("wide-test.npz")
-"""Frozen set of every family on pads of its own; nothing is selected by it."""
+"""Frozen set of every family on pads of its own, whose facts hold its world; nothing is selected by it."""
 _USUAL: Final = Nuisances()
 _BEFORE_GAIN: Final = ("pose_error_mm", "pose_error_deg", "hysteresis", "cross_talk", "gain_spread")
 
@@ -108,21 +102,3 @@ def _gains(seed: int, presses: PressSet, spread: float) -> NDArray[np.float32]:
     shape = (len(presses), *presses.counts.shape[2:])
     draws = np.random.default_rng([seed, 5]).standard_normal(shape, dtype=np.float32)
     return 1 + np.float32(spread) * draws.clip(-2, 2)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m train.data.frozen_presses", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="file of train.data.make_presses")
-    parser.add_argument("out", type=Path, metavar="OUT.npz")
-    options = parser.parse_args(arguments)
-    with ended_by_errors("frozen_presses"):
-        frozen = freeze_presses(load_presses(options.presses), SEED)
-        frozen.presses.save(options.out, compressed=True)
-    sys.stdout.write(f"{options.out}: {len(frozen)} sequences, sha256 {frozen.presses.sha256()}\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -3,7 +3,7 @@
     python -m train.data.make_presses data/gripped.npz --count 24000
     python -m train.data.make_presses data/parts.npz --mesh part.stl --count 2000
 
-Every pad's presses are solved by one of joblib's workers and written next to the file as they are completed, in
+Every pad's presses are solved by one of several processes and written next to the file as they are completed, in
 `data/gripped.npz.parts`; at the end they are joined and removed.
 """
 
@@ -14,13 +14,13 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import cache, partial
+from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Final, cast
-
-import joblib
+from threading import Thread
 
 from edge.terminal.progress_bar import progress
 from firmware_bridge.pad_geometry import PADS, USPA44
@@ -31,12 +31,11 @@ from train.families.family_shares import SHARES
 from train.surfaces.meshes import MESH, mesh_name, size_of
 from train.surfaces.poses import SCHEDULES
 
-_AT_ONCE: Final = 16
-
 
 def make_presses(world: World, path: Path) -> PressSet:
-    """Solve the presses of a world, within `quiet_workers` on all cores, and write them; an interrupted call resumes.
+    """Solve the presses of a world, on all cores, and write them; an interrupted call resumes.
 
+    Where there are several pads, call it from the main thread, and from a script only under its guard of `__main__`.
     DatasetError if files there were made otherwise or cannot be written.
     """
     facts = world.facts()
@@ -53,13 +52,11 @@ def make_presses(world: World, path: Path) -> PressSet:
     if any(load_presses(_part(folder, number)).config != facts for number in {*range(world.chunks)} - {*missing}):
         raise DatasetError(f"{folder} holds parts that were made with other settings: delete it")
     with progress("pads", world.chunks, "pad", done=world.chunks - len(missing)) as bar:
-        pool = joblib.Parallel()
-        for start in range(0, len(missing), _AT_ONCE):
-            numbers = missing[start : start + _AT_ONCE]
-            solved = cast(list[PressSet], pool(joblib.delayed(solve_pad)(world, number) for number in numbers))
-            for number, part in zip(numbers, solved, strict=True):
-                replace(part, config=facts).save(_part(folder, number))
-                bar.update()
+        solve = partial(solve_pad, world)
+        solved = map(solve, missing) if len(missing) < 2 else _workers().map(solve, missing)
+        for number, part in zip(missing, solved, strict=True):
+            replace(part, config=facts).save(_part(folder, number))
+            bar.update()
     parts = [load_presses(_part(folder, number)) for number in range(world.chunks)]
     if not any(len(part) for part in parts):
         raise DatasetError(f"every press of {path} came out lighter than {LEAST_FORCE_N} N: ask for more of them")
@@ -73,34 +70,37 @@ def _part(folder: Path, number: int) -> Path:
     return folder / f"{number:06d}.npz"
 
 
-@contextmanager
-def quiet_workers() -> Iterator[None]:
-    """Start joblib's processes, one on each core, with SIGINT ignored.
-
-    Ctrl-C reaches them too, and each would print a traceback. They inherit what is ignored; a mask is not enough, since
-    joblib's tracker of resources lifts it. joblib replaces a process that has grown by 300 MB by another, which
-    inherits nothing and sets for itself what it ignores; its warning of that is left out. Enter from the main thread.
-    """
-    with joblib.parallel_config("loky", n_jobs=-1, initializer=_begin_quietly), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
-            joblib.Parallel()(joblib.delayed(int)() for _ in range(2))
-        finally:
-            signal.signal(signal.SIGINT, before)
-        yield
+@cache
+def _workers() -> ProcessPoolExecutor:
+    """Return processes for all cores, which ignore Ctrl-C: it reaches them too, and each would print a traceback."""
+    count = len(os.sched_getaffinity(0))
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited, so that no start is open to it either
+    try:
+        pool = ProcessPoolExecutor(count, get_context("spawn"), _begin_quietly)
+        for _ in range(count):
+            pool.submit(int)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    return pool
 
 
 def _begin_quietly() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
     # shapely divides by the length of an edge, and leaves out those without length afterwards.
     warnings.filterwarnings("ignore", category=RuntimeWarning, module="shapely")
+
+
+def _end_with_parent() -> None:
+    """End this process once the one that started it was killed, which tells its workers nothing."""
+    if (parent := parent_process()) is not None:
+        parent.join()
+    os._exit(1)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     options = _parser().parse_args(arguments)
-    os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker:UserWarning"
     started_s = time.monotonic()
     with ended_by_errors("train.data.make_presses"):
         world = _world(options)
@@ -108,8 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if name.startswith(MESH):
                 sys.stdout.write(f"{size_of(name)}\n")
         sys.stdout.flush()  # before the simulation, which takes long
-        with quiet_workers() if world.chunks > 1 else nullcontext():
-            made = make_presses(world, options.out)
+        made = make_presses(world, options.out)
     rate = len(made) * made.taps / (time.monotonic() - started_s)
     sys.stdout.write(f"{options.out}: {len(made)} sequences, {rate:.0f} presses/s, sha256 {made.sha256()}\n")
     if len(made) < world.count:

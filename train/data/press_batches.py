@@ -115,8 +115,7 @@ _TOLD: Final = 0.75
 class PressBatches:
     """Batches of windows, pad inputs, and truth; windows of one tap are mirrored, half of them.
 
-    `given` is the share of windows with 1, 2, ... K taps, whose older taps are dropped. Windows of one tap are drawn
-    from sequences with fewer taps where these exist, because they are many more.
+    `given` is the share of windows with 1, 2, ... K taps, whose older taps are dropped.
     DatasetError if there are no presses of K taps.
     """
 
@@ -135,23 +134,16 @@ class PressBatches:
         if not whole.any():
             raise _lacking(taps)
         self._given, self._seed, self._nuisances, self._sensor = np.array(given), seed, nuisances, sensor
-        batch = min(batch, len(presses))
-        self._single = 0 if whole.all() else round(given[0] * batch)
-        self._parts = ((np.flatnonzero(~whole), self._single), (np.flatnonzero(whole), batch - self._single))
+        self._rows, self._batch = np.flatnonzero(whole), min(batch, len(presses))
 
     def __call__(self, number: int) -> Batch:
         """Return the batch of a number."""
         rng = np.random.default_rng([self._seed, 1, number])
-        parts = [(rows, count, [self._seed, 0, at]) for at, (rows, count) in enumerate(self._parts) if count]
-        index = np.concatenate([_rows_of_batch(number, *part) for part in parts])
+        index = _rows_of_batch(number, self._rows, self._batch, [self._seed, 0, 1])
         picked = self._presses.pick(index)
         readings, certainty = read_by_many(rng, picked, self._nuisances, self._sensor)
         taps = len(self._given)
-        there = np.ones(len(index), dtype=np.int64)
-        shares = self._given.copy()
-        shares[0] *= not self._single
-        if self._single < len(index):
-            there[self._single :] += rng.choice(taps, size=len(index) - self._single, p=shares / shares.sum())
+        there = 1 + rng.choice(taps, size=len(index), p=self._given / self._given.sum())
         readings *= (np.arange(taps) < there[:, None])[..., None, None, None]
         batch = _batch(rng, picked, readings, certainty, self._sensor)
         if taps > 1:  # a mirrored pad would turn the other way from tap to tap

@@ -127,16 +127,15 @@ class PressSet:
                 digest.update(array.data if array.dtype.kind != "U" else "\0".join(array.tolist()).encode())
         return digest.hexdigest()
 
-    def save(self, path: Path, *, compressed: bool = False) -> None:
+    def save(self, path: Path) -> None:
         """Write the presses as one npz, atomically; DatasetError if it cannot be written."""
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["touching"] = np.packbits(self.touching, axis=-1)
         facts = json.dumps({"config": self.config, "sha256": self.sha256()})
-        save = np.savez_compressed if compressed else np.savez
 
         def write(draft: Path) -> None:
             with draft.open("wb") as file:
-                save(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=facts, **arrays)
+                np.savez(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=facts, **arrays)
 
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -2,9 +2,8 @@
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from timeit import repeat
 from typing import Final, NamedTuple
@@ -20,7 +19,7 @@ from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
-from train.data.make_presses import make_presses, quiet_workers
+from train.data.make_presses import make_presses
 from train.data.presses import PressSet, one_thread
 from train.data.world import World
 from train.freeze import freeze
@@ -42,18 +41,18 @@ Figures = dict[str, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Method:
-    """Method from windows (n, taps, 3, rows, cols) in zeroed counts to patterns and deviations, (n, H, W) in [mm]."""
+    """Method from windows (n, taps, 3, rows, cols) in zeroed counts to patterns, (n, H, W) in [mm]."""
 
     name: str
     taps: int  # of a window that the method uses
     contact_level: float  # share of a pattern's maximum from which a pixel counts as touched
-    run: Callable[[NDArray[np.float32]], tuple[NDArray[np.floating], NDArray[np.float32] | None]]
+    run: Callable[[NDArray[np.float32]], NDArray[np.floating]]
     cost: Row = field(default_factory=dict)  # parameters, multiply-accumulates and run time, as cells of a row
     training: Row = field(default_factory=dict)  # steps and time, as cells of a row
 
     def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
         """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
-        return self.run(windows[:, : self.taps])[0]
+        return self.run(windows[:, : self.taps])
 
 
 @dataclass
@@ -77,9 +76,7 @@ class Workbench:
             name = f"quick-{name}"
             world = replace(world, count=_QUICK_PRESSES, taps=quick_taps, per_pad=_QUICK_PRESSES // 2)
         self.data_folder.mkdir(parents=True, exist_ok=True)
-        path = self.data_folder / f"{name}.npz"
-        with nullcontext() if path.exists() else quiet_workers():
-            return make_presses(world, path)
+        return make_presses(world, self.data_folder / f"{name}.npz")
 
     def model(self, name: str = DEFAULT_MODEL) -> ModelSession:
         """Return a shipped model, in the session of the runtime."""
@@ -106,7 +103,9 @@ class Workbench:
             _, report = load_network(self.checkpoints / f"{start}.pt")
             steps, elapsed_s = steps + report["steps"], elapsed_s + report["elapsed_s"]
         cells: Row = {"steps": steps, "training min": round(elapsed_s / 60, 1)}
-        return Method(path.stem, net.taps, level, partial(infer_network, net), _cost_of_network(net), cells)
+        return Method(
+            path.stem, net.taps, level, lambda given: infer_network(net, given)[0], _cost_of_network(net), cells
+        )
 
     def frozen(
         self,

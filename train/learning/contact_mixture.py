@@ -28,7 +28,7 @@ from edge.perception.gain_learning import (
 from firmware_bridge.in_place import check_writable, write_in_place
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.pad_constants import LEVEL_90
-from train.data.make_presses import make_presses, quiet_workers
+from train.data.make_presses import make_presses
 from train.data.presses import PressSet, load_presses
 from train.data.world import World
 from train.errors import DatasetError, ended_by_errors
@@ -274,8 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with ended_by_errors("train.learning.contact_mixture"):
         check_writable(options.out)  # before minutes are spent on it
         mixture = fit_mixture(load_presses(options.presses))
-        with quiet_workers():
-            presses = make_presses(CALIBRATION, options.presses.with_name("calibration.npz"))
+        presses = make_presses(CALIBRATION, options.presses.with_name("calibration.npz"))
         write_model(options.out, mixture, calibrated(mixture, sensors_of(presses, CALIBRATION)))
     sys.stdout.write(f"{options.out}: {len(mixture.share)} components\n")
 

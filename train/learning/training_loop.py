@@ -13,9 +13,7 @@ import io
 import json
 import os
 import time
-from collections.abc import Callable, Generator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from math import cos, isfinite, pi
 from pathlib import Path
@@ -160,13 +158,12 @@ def train(
     first, kept_s = state["step"], time.monotonic()
     started_s = kept_s - state["elapsed_s"]
     course: dict[int, float] = state["course"]
-    bar = progress(resume_path.stem, recipe.steps, "step", done=first)
-    with bar, closing(drawn_ahead(batches, first, recipe.steps)) as drawn:
-        for step, whole in enumerate(drawn, first + 1):
+    with progress(resume_path.stem, recipe.steps, "step", done=first) as bar:
+        for step in range(first + 1, recipe.steps + 1):
             rate = recipe.learning_rate * learning_rate_share((step - 1) / recipe.steps)
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            batch = whole.share(rank, world, device)
+            batch = batches(step - 1).share(rank, world, device)
             with torch.autocast(device.type, torch.bfloat16, enabled=recipe.bf16 and gains_by_bf16(device)):
                 descended = objective.loss(parallel, batch)
             optimizer.zero_grad()
@@ -188,17 +185,6 @@ def train(
                 kept_s = time.monotonic()
     net.eval()
     return time.monotonic() - started_s, course
-
-
-def drawn_ahead(batches: Batches, first: int, end: int) -> Generator[Batch, None, None]:
-    """Yield the batches from number `first` to before `end`, each drawn in a thread while the one before is used."""
-    with ThreadPoolExecutor(1, "batches") as thread:
-        coming = thread.submit(batches, first)
-        for number in range(first, end):
-            batch = coming.result()
-            if number + 1 < end:
-                coming = thread.submit(batches, number + 1)
-            yield batch
 
 
 def _place(net: PatternNet, device: torch.device) -> PatternNet:
