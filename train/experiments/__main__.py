@@ -15,7 +15,8 @@ from train.errors import ended_by_errors
 from train.experiments.blind_sensors import blind_sensors
 from train.experiments.families import families, pads
 from train.experiments.fig7 import fig7
-from train.experiments.paper_tables import angle, table3, table4, unseen
+from train.experiments.nonnegative import nonnegative
+from train.experiments.paper_tables import angle, table3, table4, taps, unseen
 from train.experiments.posed_taps import posed_taps
 from train.experiments.real import real
 from train.experiments.second_world import second_world
@@ -26,8 +27,8 @@ from train.report import Report
 EXPERIMENTS: Final[dict[str, Experiment]] = {
     work.__name__.replace("_", "-"): work
     for work in (
-        *(families, pads, trust_checks, posed_taps, real, second_world, blind_sensors, table3, table4, angle, unseen),
-        fig7,
+        *(families, pads, trust_checks, posed_taps, nonnegative, real, second_world, blind_sensors, table3, table4),
+        *(angle, taps, unseen, fig7),
     )
 }
 """Functions of the experiments by name; the first line of each one's docstring is its help."""

@@ -1,7 +1,7 @@
-"""The paper's protocol, and its tables: errors by method, scale, angle between taps, and surface.
+"""The paper's protocol, and its tables: errors by method, scale, angle between taps, number of taps, and surface.
 
 First come the data, the networks that are trained on them, and the methods that are compared; then Tables III and IV,
-and Figs. 12 and 16. Several taps of one network, Fig. 13, are in `train.experiments.posed_taps`.
+and Figs. 12, 13 and 16.
 """
 
 from collections.abc import Mapping, Sequence
@@ -246,6 +246,18 @@ def _by_angle(bench: Workbench, angle_step_deg: float) -> PressSet:
     turned = {name: replace(world, taps=2, schedule=schedule, scale=SCALE) for name, world in SETS.items()}
     parts = [bench.presses(f"paper-{name}-{angle_step_deg:g}-deg", world, 2) for name, world in turned.items()]
     return join_presses(parts)
+
+
+def taps(bench: Workbench, report: Report) -> None:
+    """Compare one network with one to seven taps, and an STSR, on the same targets: Fig. 13."""
+    data, test, validation = mixed(bench), {"test": bench.frozen("test")}, bench.frozen("validation")
+    stsr, fused = (trained(bench, one, data, validation) for one in (from_base("stsr-alike", 1, 2000), FUSED))
+    row, alone_db = judged({"network": "STSR", "taps given": 1}, stsr, test)
+    rows = [row]
+    for given in tracked(range(1, MAX_TAPS + 1), "taps", "run"):
+        rows.append(judged({"network": "fusion", "taps given": given}, fused, test, given, alone_db)[0])
+    report.say("Both networks are trained on from one of a single tap for as long. `table3` has the paper's by taps.")
+    report.table(rows, "By number of taps, test set.")
 
 
 TEST_SEED: Final = 999_000_000
