@@ -36,7 +36,7 @@ from train.data.world import World
 from train.errors import ended_by_errors
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
-from train.own import Knowledge, compared, plan_of
+from train.own import REPLACED, Knowledge, compared, plan_of
 from train.physics.pad_draws import KNOWN, RANGES
 from train.surfaces.meshes import mesh_name, size_of
 
@@ -50,7 +50,7 @@ def train(mesh: Path, out: Path, *, minutes: float, figures: float, seed: int) -
     work.mkdir(parents=True, exist_ok=True)
     print(size_of(surface), flush=True)
     handed = out / f"{name}.onnx"
-    before = load_model(handed) if handed.exists() else None
+    before = {REPLACED: load_model(handed)} if handed.exists() else {}
     shares = {surface: 1 - figures, "glyph": figures / 2, "polygon": figures / 2}
     world = World(families={family: share for family, share in shares.items() if share}, seed=seed)
     plan = plan_of(minutes, world, work)

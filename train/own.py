@@ -1,7 +1,7 @@
 """Train a model for one sensor, from what its sensor file says of it; handed over where it is the better one.
 
     python -m train.own sensor.toml --recordings trials --mesh part.stl --minutes 60 --out mine
-    python -m train.own sensor.toml --taps taps.npz --out mine
+    python -m train.own sensor.toml --taps taps.npz --beside mine/mine.onnx --out tapped
 
 The bundled models are for any pad. One for a single pad is better by decibels, and worse than none on another pad: so
 its pads are drawn within what is known of the sensor, the less is known the wider, and the model says in its contract
@@ -11,7 +11,7 @@ At the end it is compared with the bundled model, which is told the same, and wi
 pads like the sensor, of pads a little unlike it, and on --recordings, a folder of TRIAL/xela_SENSOR.csv. What loses is
 not handed over, nor what is worse than the model that is there, nor a gain in the mean that too many of the pads in
 question do not have. The same command continues an interrupted run. Taps of train.taps are a third of what it then
-learns from, and those held out decide.
+learns from; those held out decide, also against models --beside it.
 """
 
 import argparse
@@ -24,6 +24,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -49,6 +50,7 @@ from train.errors import DatasetError, TrainError, ended_by_errors
 from train.families.family_shares import FIGURES, SHARES
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
+from train.physics.gripped import SCALE
 from train.physics.pad_draws import KNOWN, RANGES, SIMULATED, constants
 from train.physics.pad_draws import Pad as SimulatedPad
 from train.report import bootstrap_interval
@@ -181,7 +183,7 @@ def compared(
     knowledge: Knowledge,
     sets: Mapping[str, PressSet],
     grips: Sequence[Grip],
-    replaced: ModelSession | None = None,
+    beside: Mapping[str, ModelSession] = MappingProxyType({}),
 ) -> Comparison:
     """Compare a model with the bundled one, told the same, and with bilinear interpolation.
 
@@ -190,11 +192,10 @@ def compared(
         knowledge: of its sensor.
         sets: presses that it was not trained on, by what they are; TAPPED are the sensor's own, read as they are.
         grips: recordings of the sensor that holds flat faces, which cover its pad.
-        replaced: the model that is there, which must not be the better one.
+        beside: further models by name, which TAPPED decide between; one that is REPLACED must not be the better one.
     """
     bundled = ModelSession(find_model(DEFAULT_MODEL))
-    sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled}
-    models |= {} if replaced is None else {REPLACED: replaced}
+    sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled} | dict(beside)
     bilinear = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"]
     cells: dict[str, list[str]] = {name: [] for name in (*models, "bilinear")}
     times_us: dict[str, list[float]] = {name: [] for name in models}
@@ -220,7 +221,7 @@ def compared(
                 gains[what], pads = gain, np.unique(presses.pad)
                 losing[what] = float(np.mean([gained[presses.pad == pad].mean() < 0 for pad in pads]))
             # One that is made for a wider range is better outside of what is known by now.
-            decides = name != REPLACED or what != UNLIKE
+            decides = name in (bundled.name, "bilinear") or what == TAPPED or (name == REPLACED and what != UNLIKE)
             if name != OWN and decides and (high < 0 if what == UNLIKE or name == REPLACED else low <= 0):
                 objections.append(f"on {what} it is {gain} dB to {name}")
         if TAPPED not in sets and what != UNLIKE and losing[what] > MOST_LOSING:  # taps show which pad it is
@@ -279,7 +280,12 @@ def _train(options: argparse.Namespace) -> None:
     middle = constants(knowledge.middle())
     taps = {} if options.taps is None else load_tap_parts(options.taps, knowledge.name, knowledge.pad, middle)
     handed = out / f"{out.resolve().name}.onnx"
-    before = ModelSession(handed) if handed.exists() else None
+    beside = {one.name: one for one in map(ModelSession, options.beside)}
+    beside |= {REPLACED: ModelSession(handed)} if handed.exists() else {}
+    for name, one in beside.items():
+        if one.contract.scale != SCALE or (one.contract.taps > 1 and not one.contract.takes_poses):
+            got = f"{name} is a model of {one.contract.taps} taps at x{one.contract.scale}"
+            raise DatasetError(f"{got}, expected one of a single tap, or of several with poses, at x{SCALE}")
     if not knowledge.pad.constants and knowledge.pad.gains_certainty < _FIFTH:
         raise DatasetError(
             "nothing is known of this sensor, and a model for any sensor is there: lay a weight on it with "
@@ -298,7 +304,7 @@ def _train(options: argparse.Namespace) -> None:
     plan = plan_of(options.minutes, world, work)
     path, judges = trained(knowledge, world, plan, COMPARED, work / f"{handed.stem}.pt", taps.get("training"))
     judges |= {TAPPED: taps["test"]} if taps else {}
-    verdict = compared(ModelSession(path), knowledge, judges, grips, before)
+    verdict = compared(ModelSession(path), knowledge, judges, grips, beside)
     say(verdict.table)
     if verdict.objection is not None:
         say(f"not handed over: {verdict.objection}")
@@ -379,6 +385,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--recordings", type=Path, metavar="FOLDER", help="TRIAL/xela_SENSOR.csv of grips of flat faces, to compare by")
     add("--without-recordings", action="store_true", help="hand it over by simulated presses alone")
     add("--taps", type=Path, metavar="FILE", help="the sensor's own taps, as train.taps makes them, to learn from, too")
+    add("--beside", type=Path, action="append", default=[], metavar="MODEL", help="another model to compare with")
     add("--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add")
     add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm (1)")
     add("--minutes", type=positive, default=20.0, help="about how long all takes (20)")

@@ -112,9 +112,9 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     bundled = ModelSession(find_model("stsr-int8"))
     _, objection, _ = compared(bundled, found, sets, [])
     assert objection is not None and UNLIKE not in objection, "no worse there"
-    _, objection, _ = compared(tiny, found, sets, [], bundled)
+    _, objection, _ = compared(tiny, found, sets, [], {REPLACED: bundled})
     assert objection is not None and objection.count(f"to {REPLACED}") == 1, "the better one stays, by pads like it"
-    _, objection, _ = compared(bundled, found, sets, [], bundled)
+    _, objection, _ = compared(bundled, found, sets, [], {REPLACED: bundled})
     assert f"to {REPLACED}" not in objection, "the same one may be handed over again"
 
 
@@ -131,6 +131,7 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
             "of a uSPa46, expected a uSPa44",
         ),
         (FILE, [], "nothing to compare it on: .* pass --recordings or --taps, or --without-recordings"),
+        (FILE, ["--beside", "x4.onnx"], "x4 is a model of 2 taps at x4, expected one of a single tap, or of several"),
         (FILE, ["--mesh", "none.stl"], "none.stl: cannot be read"),
         (FILE, ["--recordings", "."], "holds no recordings: expected a folder of TRIAL/xela_SENSOR.csv"),
         (FILE, ["--recordings", "free"], "nothing presses the pad in trial of free, expected a grip of a flat face"),
@@ -139,6 +140,7 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, held, options, told):
     monkeypatch.chdir(tmp_path)
+    write_model(Path("x4.onnx"), make_contract(scale=4, taps=2))
     Path("played/trial").mkdir(parents=True)
     Path("free/trial").mkdir(parents=True)
     Path("free/trial/xela_4.csv").write_text(f"{','.join(csv_header())}\n{'30000,' * 47}30000\n")

@@ -12,6 +12,7 @@ from matplotlib.image import imsave
 from press_samples import make_press_set
 from tapping_robot import Robot, plate_mesh
 
+from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -238,8 +239,11 @@ def test_what_loses_on_own_taps_is_not_handed_over(tapped, tmp_path):
     parts = load_tap_parts(folder / "taps.npz", "4", found.pad, constants(found.middle()))
     assert set(parts) == {"training", "validation", "test"} and len(np.unique(parts["test"].pad)) == 3
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
-    table, objection, _ = compared(tiny, found, {TAPPED: parts["test"]}, [])
+    bundled = ModelSession(find_model("stsr-int8"))
+    table, objection, _ = compared(tiny, found, {TAPPED: parts["test"]}, [], {bundled.name: bundled})
     assert OWN in table and objection is not None and f"on {TAPPED} it is -" in objection
+    _, objection, _ = compared(bundled, found, {TAPPED: parts["test"]}, [], {"tiny": tiny})
+    assert objection is not None and "to tiny" not in objection, "better than tiny, and no better than itself"
 
 
 def test_taps_of_another_sensor_or_of_none_are_refused(tapped, tmp_path):
@@ -277,7 +281,7 @@ def test_from_a_robots_taps_to_a_model(tmp_path, capsys, limits):
     command = [str(tmp_path / "sensor.toml"), "--taps", str(tmp_path / "taps.npz"), "--minutes", "0.01"]
     failed = False
     try:
-        own.main([*command, "--out", str(tmp_path / "mine")])
+        own.main([*command, "--out", str(tmp_path / "mine"), "--beside", str(find_model("stsr"))])
     except SystemExit as ended:
         failed = ended.code == 1
     said = capsys.readouterr().out
