@@ -15,7 +15,6 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.recording.csv_reader import csv_header
-from firmware_bridge.recording.tracks import mounting_text, read_mounting
 from firmware_bridge.scans.can_id_maps import (
     ID_MAPS,
     LAYOUT_A_MAP,
@@ -182,11 +181,3 @@ def test_csv_of_the_vendors_server_alone_is_put_in_place(tmp_path):
             assert link.kind == "replay"
             (scan,) = [scan for _ in range(2) if not link.ended for scan in link.read(1.0)]
         assert np.array_equal(scan.counts, expected) and link.counters()["scans"] == 1
-
-
-def test_gains_of_a_mounting_recorded_earlier_are_1_or_refused():
-    text = mounting_text(Mounting(signs=(-1, 1, 1)))
-    ones = text.replace("}", f', "gains": {[1.0] * 48}}}')
-    assert read_mounting(ones, 16) == Mounting(signs=(-1, 1, 1))
-    with pytest.raises(ValueError, match="gains other than 1"):
-        read_mounting(ones.replace("1.0]", "1.1]"), 16)
