@@ -197,6 +197,7 @@ class Loop:
         """Keep what was learned; there are no more results."""
         if self._keeper is not None:
             keeper, self._keeper = self._keeper, None
+            self._keep_learned(keeper)  # from the last contact, which no pattern followed
             if (trouble := keeper.close()) is not None:
                 self._tell(Event(self._clock_ns(), "note", None, f"learned gains are not kept: {trouble}"))
         self._count()
@@ -247,12 +248,15 @@ class Loop:
     def _make_patterns(self) -> None:
         """Make the results of all sensors that wait for their patterns, those that have waited longest first."""
         while self._runtime.waiting:
-            results = self._runtime.infer(self._latency_clock)
-            if self._keeper is not None:
-                for name, pad in self._runtime.take_learned().items():
-                    self._keeper.keep(name, pad)
-            for result in results:
+            for result in self._runtime.infer(self._latency_clock):
                 self._follow(result)
+            if self._keeper is not None:
+                self._keep_learned(self._keeper)
+
+    def _keep_learned(self, keeper: "GainKeeper") -> None:
+        """Begin to write what was learned since the last pattern."""
+        for name, pad in self._runtime.take_learned().items():
+            keeper.keep(name, pad)
 
     def _follow(self, result: Result) -> None:
         """Count a result, and hand it on."""

@@ -89,7 +89,7 @@ def refuse_emulated(sensor_file: SensorFile, kind: SourceKind, origin: SourceKin
             parts = ", ".join(part for part in PARTS if part in entry.emulated)
             raise SensorFileError(
                 f"the sensor file has {parts} of an emulated sensor {name}, and this {this}: write a new one with "
-                f"edge-sr doctor --out, or leave --sensor out"
+                "edge-sr doctor --out, or leave --sensor out"
             )
 
 

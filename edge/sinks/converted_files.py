@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edge.errors import SinkError
 from edge.perception.record_fields import FIELDS, MAPS, Field, Out
 from edge.sinks.ros2.map_messages import UNITS, recorded_map
-from edge.sinks.ros2.messages import GRID, RESULT
+from edge.sinks.ros2.messages import GRID, IMAGE, RESULT
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.poses import PoseTrack, TimedPose
@@ -158,9 +158,14 @@ class _Rows:
             yield self._row
 
     def _topic_of(self, channel: Channel, schema: Schema | None) -> _Topic | None:
+        sensor, _, name = channel.topic.rpartition("/")
+        if schema is not None and schema.name == IMAGE.name and name in _MAP_NAMES:
+            raise RecordingError(
+                f"{self._path}: its maps are images, as of earlier releases: convert it with one, or make its results "
+                "again by edge-sr replay"
+            )
         if schema is None or schema.name not in (SCAN_NAME, BASELINE_NAME, RESULT.name, GRID.name):
             return None
-        sensor, _, name = channel.topic.rpartition("/")
         return _Topic(sensor, name, MessageType.of(schema.name, schema.data.decode()))
 
     def _read(self, topic: _Topic, log_ns: int, data: bytes) -> None:

@@ -21,8 +21,6 @@ from firmware_bridge.links.slcan_serial import BUS_ERRORS, PortReader, SlcanSeri
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
-LINES = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
-
 
 def test_what_came_before_the_loss_is_not_lost(monkeypatch):
     """The last byte may come alone, and the cable go before the next look: it may close a scan."""

@@ -88,7 +88,7 @@ def test_in_a_file_of_others_scans_are_found(tmp_path, compression):
     assert "the mounting of sensor 4 is not in the file" in recording.notes[0]
 
 
-OF_A_SCAN, OF_A_BASELINE, OF_A_SENSOR = channel_of(SCAN), channel_of(BASELINE, 2), channel_of(SENSOR, 2)
+OF_A_BASELINE, OF_A_SENSOR = channel_of(BASELINE, 2), channel_of(SENSOR, 2)
 UNKNOWN_DATE = {"created_unix_s": float("nan")}
 SEATED = {"order": list(range(16)), "swap_xy": False, "signs": [1, 1, 1]}
 

@@ -10,29 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from edge_samples import ROOT, fake_source, make_scan
-from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, record_into
+from mcap_samples import SURE, TURNED, arrays_of, make_results, messages_alone, odd_scans, record_into
 
-from edge.api import PadPose, Result, Scan, TimedPose
+from edge.api import PadPose, Result, TimedPose
 from edge.cli import main as cli
 from edge.perception.record_fields import MAPS
 from edge.sinks.json_records import record
 from edge.sinks.registry import open_sink
-from firmware_bridge.links.replay import ReplayLink
+from edge.sinks.ros2.messages import GRID, IMAGE
 from firmware_bridge.recording.formats import load_recording
-
-OLD = Path(__file__).parent / "first_version"
 
 
 def convert(*words: object) -> int:
     return cli.main(["convert", *map(str, words)])
-
-
-def scans_of(path: Path) -> list[Scan]:
-    with ReplayLink([path], paced=False) as link:
-        scans = []
-        while not link.ended:
-            scans += link.read(0.0)
-        return scans
 
 
 @pytest.fixture
@@ -125,11 +115,13 @@ def test_two_sensors_whose_names_make_one_file_name_get_numbers(tmp_path):
         ("press.mcap taken.npz", 5, "taken.npz exists: give another name, or delete it first"),
         ("press.mcap none/new.npz", 5, "cannot write none/new.npz: No such file"),
         ("text.mcap new.npz", 2, "text.mcap: not an MCAP file"),
+        ("images.mcap new.npz", 2, "images.mcap: its maps are images, as of earlier releases"),
     ],
 )
 def test_what_cannot_be_converted_is_one_line_and_makes_nothing(words, code, said, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    record_into(Path("press.mcap"), make_results([make_scan()]))
+    record_into(Path("press.mcap"), make_results([make_scan(press_counts=3000)]))
+    messages_alone(Path("press.mcap"), Path("images.mcap"), kinds={GRID.name: IMAGE.name})
     for name in ("text.mcap", "taken.npz"):
         Path(name).write_text("text")
     Path("bag.mcap").mkdir()

@@ -279,7 +279,7 @@ class TestKeeping:
     def test_a_stream_keeps_what_its_runtime_learns_of_a_device(self, file, kind):
         changed = {"file gone": "cannot be read", "turned by hand": "the mounting of sensor 4 was"}.get(kind)
         events = []
-        scans = scans_of(draw_contacts(60, draw_gains()))
+        scans = scans_of(draw_contacts(8, draw_gains()))  # the last of which teaches as its pad is let go
         link = FakeLink([[scan] for scan in scans], kind="device" if changed else kind)
         link.patient = True  # else newer scans overtake contacts, and those get no pattern
         with Source(link, sensor_file=load_sensor_file(file)) as source:

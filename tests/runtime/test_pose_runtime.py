@@ -89,6 +89,7 @@ class TestChoice:
         lose_pose(pad)
         result = pad.tap()
         assert result.taps_used == 1 and result.pose is None and result.poses.tolist() == [[0] * 5]
+        assert pad.kinds == ["tap_without_pose"]
         assert pad.tap(PadPose(2, 0)).poses[:, 0].tolist() == [0, -2], "the tap in the middle has none"
         for _ in range(8):  # more than the window holds
             lose_pose(pad)

@@ -86,10 +86,11 @@ def messages_alone(
     start_ns: int | None = None,
     more: Path | None = None,
     metadata: Mapping[str, dict[str, str]] = MappingProxyType({}),
+    kinds: Mapping[str, str] = MappingProxyType({}),
 ) -> Path:
     """Copy messages of these topics and times (all by default), as tools do: without attachments, with other metadata.
 
-    Those of `more`, another recording, follow.
+    Those of `more`, another recording, follow. Messages of some `kinds` are called others.
     """
     with to.open("wb") as target:
         writer = Writer(target)
@@ -101,7 +102,7 @@ def messages_alone(
             with one.open("rb") as source:
                 for schema, channel, message in make_reader(source).iter_messages(topics, starting_at=start_ns):
                     if schema is not None and channel.id not in channels:
-                        kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                        kind = writer.register_schema(kinds.get(schema.name, schema.name), schema.encoding, schema.data)
                         channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
                     writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
         writer.finish()

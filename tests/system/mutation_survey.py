@@ -94,7 +94,7 @@ EQUIVALENT: dict[str, dict[str, str]] = {
     },
     "taps": {
         "__init__: -1 -> 1": "before a pattern there is no pose, whatever the number of its tap",
-        "_choose: 0 -> 1": "a tap alone has no turn, whatever the step of the schedule",
+        "_choose: 0.0 -> 1.0": "a tap alone has no turn, whatever the step of the schedule",
         "_choose: earlier.away_mm(other, self._radius_mm) < 0.5 -> earlier.away_mm(other, self._radius_mm) <= 0.5": (
             "no tap lies half a millimetre away to the last digit"
         ),
