@@ -2,4 +2,4 @@
 
 from firmware_bridge.errors import need
 
-need("train", "torch", "scipy", "trimesh", "shapely", "joblib")
+need("train", "torch", "scipy", "trimesh", "shapely")

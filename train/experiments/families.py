@@ -1,18 +1,16 @@
 """The shipped model on every family of shapes on unseen pads, and on pads off the nominal one.
 
-Of families no choice depended on the presses: networks and baselines were settled on training and validation presses,
-on other pads. Of pads each constant is changed alone. Shapes, poses, depths, drags, friction and every draw of the
-nuisances are then the same on all pads, so that losses are press by press; half of the shapes are the paper's, half
-random figures.
+Of pads each constant is changed alone. Shapes, poses, depths, drags, friction and every draw of the nuisances are then
+the same on all pads, so that losses are press by press.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from timeit import repeat
-from typing import Final, NamedTuple, cast
+from typing import Final, NamedTuple
 
-import joblib
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,9 +23,9 @@ from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.press_batches import in_units, read_presses
-from train.data.presses import SEED, PressSet, one_thread
+from train.data.presses import SEED, one_thread
 from train.data.world import World, press_shapes
-from train.experiments.workbench import SHORT, Figures, Inferred, Workbench, infer_presses, name_of
+from train.experiments.workbench import SHORT, Inferred, Workbench, infer_presses, name_of
 from train.families.family_shares import SHARES, Tapped, draw_shape
 from train.learning.checkpoint import best_contact_level
 from train.physics.gripped import MAX_INDENTATION_MM, SCALE, GrippedPad
@@ -35,8 +33,7 @@ from train.physics.pad_draws import INPUTS, NOMINAL, Pad
 from train.physics.sensor_noise import Nuisances
 from train.report import Report, Row, with_interval
 
-TRAINING: Final = World(count=24_000, per_pad=48, seed=67)
-"""Settings of data/gripped.npz in the Makefile."""
+TRAINING: Final = World(count=24_000, per_pad=48, seed=67)  # settings of data/gripped.npz in the Makefile
 _LEVELLED: Final = 2000  # training presses by which the level of contact of a baseline is chosen
 _BEST: Final = "linear map"  # of the baselines on validation presses
 _LEVEL: Final = "90"
@@ -47,7 +44,7 @@ _AT_ONCE: Final = 64
 class Found(NamedTuple):
     """Errors of one method on the wide test set, and its run time."""
 
-    figures: Figures
+    figures: dict[str, NDArray[np.float64]]  # every metric, (n,) each
     run_time_us: float
 
 
@@ -92,10 +89,10 @@ def families(bench: Workbench, report: Report) -> None:
         for name, (figures, run_time_us) in found.items()
     ]
     report.table(rows, "All families.")
-    report.table(family_rows(found, wide), f"PSNR in dB by family; `over` is over {_BEST}, press by press.")
+    report.table(_family_rows(found, wide), f"PSNR in dB by family; `over` is over {_BEST}, press by press.")
     if _LEVEL in model.contract.interval_levels:
         text = f"Pixels whose truth the {_LEVEL} % interval holds, in %, by region of the predicted pattern."
-        report.table(interval_rows(model, inferred, truth, wide), text)
+        report.table(_interval_rows(model, inferred, truth, wide), text)
 
 
 def nearest_presses(known: NDArray[np.float32], patterns: NDArray[np.float16]) -> Method:
@@ -117,7 +114,7 @@ def nearest_presses(known: NDArray[np.float32], patterns: NDArray[np.float16]) -
     return nearest
 
 
-def family_rows(found: Mapping[str, Found], wide: FrozenPresses) -> list[Row]:
+def _family_rows(found: Mapping[str, Found], wide: FrozenPresses) -> list[Row]:
     """Return the PSNR of every method by family and in total, and the model's margin over the best baseline."""
     rows: list[Row] = []
     for family, which in _families(wide):
@@ -132,7 +129,7 @@ def family_rows(found: Mapping[str, Found], wide: FrozenPresses) -> list[Row]:
     return rows
 
 
-def interval_rows(
+def _interval_rows(
     model: ModelSession, inferred: Mapping[str, Inferred], truth: NDArray[np.float32], wide: FrozenPresses
 ) -> list[Row]:
     """Return the share of pixels that the model's intervals hold, by region: of all presses, and by family."""
@@ -152,7 +149,7 @@ def interval_rows(
 
 
 def _families(wide: FrozenPresses) -> list[tuple[str, NDArray[np.bool_]]]:
-    """Return names in the catalogue's order with a mask of each family's presses; `all` comes last."""
+    """Return names in the order of SHARES with a mask of each family's presses; `all` comes last."""
     family = wide.presses.family
     some = [(name, family == name) for name in SHARES if (family == name).any()]
     return [*some, ("all", np.ones(len(wide), dtype=bool))]
@@ -160,75 +157,35 @@ def _families(wide: FrozenPresses) -> list[tuple[str, NDArray[np.bool_]]]:
 
 SHAPES_SEED: Final = 4711
 CONSTANTS: Final = (*INPUTS, "pitch_mm", "free_sides")
-PERCENT: Final = (5, 10, 20)
-
-
-class OffPad(NamedTuple):
-    """Pad with one constant changed by percent of its nominal value, or of the whole free sides."""
-
-    constant: str
-    percent: int
-
-    @property
-    def pad(self) -> Pad:
-        """Constants of the changed pad."""
-        nominal = getattr(NOMINAL, self.constant)
-        off = self.percent / 100 * (nominal if self.constant != "free_sides" else 1.0)
-        return replace(NOMINAL, **{self.constant: nominal + off})
-
-    @property
-    def can_be(self) -> bool:
-        """True where such a pad is possible: rubber does not swell when pressed, and sides do not push back."""
-        return self.pad.poisson <= 0.499 and self.pad.free_sides >= 0
-
-
-NONE_OFF: Final = OffPad("thickness_mm", 0)
+PERCENT: Final = (5, 10, 20)  # of a constant's nominal value, or of the whole free sides
 
 
 def pads(bench: Workbench, report: Report) -> None:
     """Evaluate the shipped model on pads that are off the nominal one."""
-    percent, count = (PERCENT[-1:], 4) if bench.quick else (PERCENT, 40)
-    names = CONSTANTS[:2] if bench.quick else CONSTANTS
-    off = [OffPad(name, sign * part) for name in names for part in percent for sign in (-1, 1)]
-    off = [NONE_OFF, *(one for one in off if one.can_be)]
-    shapes = draw_shapes(count)
-    pool = joblib.Parallel(n_jobs=-1, return_as="generator")
-    jobs = cast(Iterator[PressSet], pool(joblib.delayed(pressed)(one.pad, shapes) for one in off))
-    read = {one: freeze_presses(made, SEED) for one, made in zip(tracked(off, "pads", "pad"), jobs, strict=True)}
-    model = bench.model()
-    scores = {
-        name: {
-            one: psnr_db(infer_presses(model, frozen, known).patterns, frozen.patterns(), MAX_INDENTATION_MM)
-            for one, frozen in read.items()
-        }
-        for known, name in SHORT.items()
-    }
-    plain = {name: with_interval(psnr[NONE_OFF], np.arange(count)) for name, psnr in scores.items()}
+    percent, names, count = (PERCENT[-1:], CONSTANTS[:2], 4) if bench.quick else (PERCENT, CONSTANTS, 40)
+    shapes, model, every = draw_shapes(count), bench.model(), np.arange(count)
+    plain = _psnr_db(model, NOMINAL, shapes)
+    rows: list[Row] = []
+    for constant, part in tracked(list(product(names, percent)), "pads", "constant"):
+        cells: Row = {"constant": constant, "off by %": part}
+        for word, sign in (("down", -1), ("up", 1)):
+            nominal = getattr(NOMINAL, constant)
+            off = sign * part / 100 * (nominal if constant != "free_sides" else 1.0)
+            pad = replace(NOMINAL, **{constant: nominal + off})
+            # Rubber does not swell when pressed, and sides do not push back.
+            found = _psnr_db(model, pad, shapes) if pad.poisson <= 0.499 and pad.free_sides >= 0 else {}
+            for name, psnr_db_of in plain.items():
+                cells[f"{name}, {word}"] = with_interval(psnr_db_of - found[name], every) if found else None
+        rows.append(cells)
     report.say(
         f"{name_of(model)}, one tap; {count} shapes, "
         f"{count // 2} of the paper's surfaces and as many random figures, each pressed alike on every pad and read "
         "with the same draws of all nuisances. All else about a pad is nominal. PSNR on the nominal pad: "
-        + "; ".join(f"{name} {value} dB" for name, value in plain.items())
+        + "; ".join(f"{name} {with_interval(values, every)} dB" for name, values in plain.items())
         + ". Known: the constants that the model takes, and the gains; pitch and free sides it cannot be given. Free "
         "sides are off by percent of what finite elements give, upwards alone; a Poisson's ratio 20 % up cannot be."
     )
-    rows = loss_rows(scores, list(read))
     report.table(rows, "PSNR lost against the nominal pad in dB, press by press, with 95 % intervals.")
-
-
-def loss_rows(scores: dict[str, dict[OffPad, NDArray[np.float64]]], off: list[OffPad]) -> list[Row]:
-    """Return the loss of each method on each pad, down and up side by side."""
-    rows: list[Row] = []
-    for constant, percent in dict.fromkeys((one.constant, abs(one.percent)) for one in off if one.percent):
-        row: Row = {"constant": constant, "off by %": percent}
-        for name, psnr in scores.items():
-            for word, sign in (("down", -1), ("up", 1)):
-                lost = psnr.get(OffPad(constant, sign * percent))
-                row[f"{name}, {word}"] = (
-                    None if lost is None else with_interval(psnr[NONE_OFF] - lost, np.arange(len(lost)))
-                )
-        rows.append(row)
-    return rows
 
 
 def draw_shapes(count: int) -> list[tuple[str, Tapped]]:
@@ -240,8 +197,12 @@ def draw_shapes(count: int) -> list[tuple[str, Tapped]]:
 
 
 @one_thread()
-def pressed(pad: Pad, shapes: list[tuple[str, Tapped]]) -> PressSet:
-    """Press all shapes onto one pad."""
-    rng = np.random.default_rng(SHAPES_SEED + 1)
-    families = np.array([family for family, _ in shapes])
-    return press_shapes(rng, GrippedPad(pad), families, [shape for _, shape in shapes], 0)
+def _psnr_db(model: ModelSession, pad: Pad, shapes: list[tuple[str, Tapped]]) -> dict[str, NDArray[np.float64]]:
+    """Return the PSNR of each shape on a pad, (n,), with nothing and all known of it."""
+    rng, families = np.random.default_rng(SHAPES_SEED + 1), np.array([family for family, _ in shapes])
+    pressed = press_shapes(rng, GrippedPad(pad), families, [shape for _, shape in shapes], 0)
+    frozen = freeze_presses(pressed, SEED)
+    return {
+        name: psnr_db(infer_presses(model, frozen, known).patterns, frozen.patterns(), MAX_INDENTATION_MM)
+        for known, name in SHORT.items()
+    }
