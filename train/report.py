@@ -18,17 +18,13 @@ Row = dict[str, Cell]
 class Report:
     """Collector of an experiment's results, written as NAME.md and, where it has pictures, NAME.png.
 
-    The head of the page names the experiment's source, and the models and frozen sets that it has used by then. A quick
-    run was cut short for a test: said at the top of the page.
+    The head of the page names the experiment's source, and the models and frozen sets that it has used by then.
     """
 
-    def __init__(
-        self, name: str, folder: Path, source: str, models: Iterable[Path] = (), *, quick: bool = False
-    ) -> None:
+    def __init__(self, name: str, folder: Path, source: str, models: Iterable[Path] = ()) -> None:
         self._path = folder / f"{name}.md"
         self._source = source
         self._models = models
-        self._quick = quick
         self._parts: list[str] = []
         folder.mkdir(parents=True, exist_ok=True)
 
@@ -61,8 +57,6 @@ class Report:
     def write(self) -> Path:
         """Write the page, and return its path."""
         head = [f"# {self._path.stem}", str(provenance(_command(), [self._source], self._models, SEED))]
-        if self._quick:
-            head.append("**A quick run, for the tests: no figure here means anything.**")
         self._path.write_text("\n\n".join(head + self._parts) + "\n")
         return self._path
 

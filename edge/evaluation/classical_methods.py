@@ -40,17 +40,6 @@ def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
     }
 
 
-def method_macs(name: str, scale: int, rows: int = 4, cols: int = 4) -> int:
-    """Return the multiply-accumulates of one scan in a method of `fitted_methods`.
-
-    Interpolation counts as it is computed here: two matrix products, along rows and columns, and the gain.
-    """
-    pixels = rows * scale * cols * scale
-    if name == "linear map":
-        return 3 * rows * cols * pixels
-    return rows * scale * rows * cols + pixels * cols + pixels
-
-
 def bilinear(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float64]:
     """Interpolate taxels (..., rows, cols) to (..., rows*scale, cols*scale).
 

@@ -8,11 +8,11 @@ from train.experiments.paper_tables import HELD_OUT, training_sets
 
 ERRORS = {"test PSNR dB", "run time ms"}
 COLUMNS = {
-    "table3": [ERRORS | {"method", "validation PSNR dB", "test SSIM", "parameters", "MMAC"}],
-    "table4": [ERRORS | {"scale", "paper's test PSNR dB", "MMAC"}],
+    "table3": [ERRORS | {"method", "validation PSNR dB", "test SSIM", "parameters"}],
+    "table4": [ERRORS | {"scale"}],
     "angle": [ERRORS | {"network", "angle deg", "over STSR dB"}],
     "taps": [ERRORS | {"network", "taps given", "over STSR dB"}],
-    "unseen": [ERRORS | {"trained on", "tested on", "taps", "steps"}],
+    "unseen": [ERRORS | {"trained on", "tested on", "taps"}],
     "families": [{"method", "run time us"}, {"family", "model, over"}, {"edge", "far"}],
     "pads": [{"constant", "model, down", "model, all known, up"}],
     "posed-taps": [
@@ -33,7 +33,7 @@ COLUMNS = {
 )
 def test_it_runs_in_miniature(tmp_path, tmp_path_factory, name):
     page = run(name, quick_bench(tmp_path_factory), tmp_path)
-    assert page.read_text().startswith(f"# {name}\n") and "quick run" in page.read_text()
+    assert page.read_text().startswith(f"# {name}\n")
     tables = tables_of(page)
     assert len(tables) == len(COLUMNS[name])
     for rows, columns in zip(tables, COLUMNS[name], strict=True):

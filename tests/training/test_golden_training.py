@@ -11,7 +11,7 @@ import numpy as np
 from train.data.press_batches import PosedBatches, PressBatches, read_presses, stated_poses
 from train.data.presses import join_presses
 from train.data.world import World, solve_pad
-from train.experiments.sensor_faults import FAULTS
+from train.experiments.trust_checks import FAULTS
 from train.families.family_shares import SHARES
 from train.learning.checks import moved, spoiled
 from train.physics.sensor_noise import Nuisances

@@ -21,14 +21,12 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
-from firmware_bridge.scans.scan import ABSENT, ScanSeries
+from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from train.errors import DatasetError
-from train.physics.sensor_noise import neighbours
 
 REST_SCANS: Final = 20  # scans at the end of a recording, where one of the grips has been released
-_TAXELS: Final = USPA44.taxel_count
 _Z: Final = AXES.index("z")
 _AS_WIRED: Final = Mounting()
 _UNKNOWN: Final = SensorFile()
@@ -48,11 +46,6 @@ class Grip:
         return np.stack([deformation(scan, self.free, self.mounting) for scan in self.counts])
 
 
-def z_of(counts: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return readings of z, (n, taxels), from scans (n, 3, rows, cols)."""
-    return counts[:, _Z].reshape(-1, _TAXELS)
-
-
 def loaded(counts: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return a mask of scans (n,) from zeroed counts (n, 3, rows, cols) in which some taxel is pressed."""
     return counts[:, _Z].max(axis=(1, 2)) > LOAD_LIMIT_COUNTS
@@ -70,12 +63,9 @@ def recording_paths(folder: Path) -> list[Path]:
 
 
 def check_track(recording: Recording, track: Track, entry: SensorEntry) -> None:
-    """Print what is not read of a recording, and refuse what would teach something wrong of a sensor.
+    """Print what is not read of a recording, and refuse what would teach something wrong of the sensor of an entry.
 
-    The sensor file has it as `entry`.
-
-    Raises:
-        DatasetError: its pad is of another model, or only one of recording and file is of an emulated sensor.
+    DatasetError if its pad is of another model, or only one of recording and file is of an emulated sensor.
     """
     sys.stderr.writelines(f"{note}\n" for note in recording.notes)
     if track.geometry != USPA44 or entry.mounting.taxel_count != USPA44.taxel_count:
@@ -91,10 +81,9 @@ def check_track(recording: Recording, track: Track, entry: SensorEntry) -> None:
 
 
 def recorded_grips(folder: Path, known: SensorFile = _UNKNOWN) -> list[Grip]:
-    """Load the recordings of sensors as a sensor file has them mounted, each with its sensor's rest level.
+    """Load the recordings of sensors as a sensor file has them mounted; DatasetError if there are none of such.
 
     The rest level is taken from the end of the trial that ends with the least load: there the grip was released.
-    DatasetError if there are none, or one cannot be read or is not of such a sensor.
     """
     paths = recording_paths(folder)
     if not paths:
@@ -141,10 +130,7 @@ def _placed_counts(path: Path, entry: SensorEntry) -> NDArray[np.integer]:
 
 
 def recorded_contacts(folder: Path, known: SensorFile = _UNKNOWN) -> dict[str, NDArray[np.float32]]:
-    """Return the scans under load of each sensor, (n, 3, rows, cols) zeroed; repeated scans are left out.
-
-    DatasetError as of `recorded_grips`, or if none is under load.
-    """
+    """Return the scans under load of each sensor, (n, 3, rows, cols) zeroed, without repeats; DatasetError if none."""
     contacts: dict[str, list[NDArray[np.float32]]] = {}
     for grip in recorded_grips(folder, known):
         renewed = np.append(True, (np.diff(grip.counts, axis=0) != 0).any(axis=(1, 2, 3)))
@@ -156,24 +142,15 @@ def recorded_contacts(folder: Path, known: SensorFile = _UNKNOWN) -> dict[str, N
     return {sensor: np.concatenate(parts) for sensor, parts in contacts.items()}
 
 
-def neighbours_mean(z: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the mean of each taxel's edge neighbours, (n, taxels): bilinear at its place, with fewer at the rim."""
-    beside = neighbours(USPA44.rows, USPA44.cols) > 0
-    return z @ (beside / beside.sum(axis=0))
-
-
 class Played(NamedTuple):
-    """Output of the runtime for the scans of one grip that are under load: zeroed counts without a hidden taxel.
-
-    Patterns are (n, H, W) in [mm], NaN where there was none; believed (n,) unless any reason spoke against it.
-    """
+    """Output of the runtime for the scans of one grip that are under load."""
 
     zeroed: NDArray[np.float32]
-    patterns: NDArray[np.float32]
-    believed: NDArray[np.bool_]
+    patterns: NDArray[np.float32]  # (n, H, W) in [mm], NaN where there was none
+    believed: NDArray[np.bool_]  # (n,) unless any reason spoke against it
 
 
-def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | None = None) -> Played:
+def play(grip: Grip, model: ModelSession, pad: Pad | None = None) -> Played:
     """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred."""
     name = grip.free.sensor
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
@@ -185,8 +162,6 @@ def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | 
     none = np.full(model.contract.pattern_shape, np.nan, dtype=np.float32)
     patterns, believed = [], []
     for number, raw in enumerate(grip.counts.astype(np.int32)):
-        if hidden is not None:
-            raw.reshape(3, -1)[:, hidden] = ABSENT
         result = runtime.push(series.close(raw, number * 16_750_000))
         patterns.append(none if result.pattern is None else result.pattern)
         believed.append(result.trusted is not False)

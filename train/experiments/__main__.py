@@ -30,15 +30,14 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {
         *(families, pads, trust_checks, posed_taps, nonnegative, real, second_world, blind_sensors, table3, table4),
         *(angle, taps, unseen, fig7),
     )
-}
-"""Functions of the experiments by name; the first line of each one's docstring is its help."""
+}  # functions by name; the first line of each one's docstring is its help
 
 
 def run(name: str, bench: Workbench, folder: Path) -> Path:
     """Run an experiment, and return its page."""
     work = EXPERIMENTS[name]
     bench.used.clear()
-    report = Report(name, folder, inspect.getfile(work), bench.used, quick=bench.quick)
+    report = Report(name, folder, inspect.getfile(work), bench.used)
     work(bench, report)
     return report.write()
 

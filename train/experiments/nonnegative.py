@@ -22,9 +22,8 @@ from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.press_batches import stated_poses
 from train.data.presses import SEED
-from train.experiments.half_space import draw_presses
 from train.experiments.posed_taps import PAPER, USUAL, presses_of
-from train.experiments.second_world import SEEDS
+from train.experiments.second_world import SEEDS, draw_presses
 from train.experiments.workbench import Workbench, infer, known_pads, name_of
 from train.families.family_shares import FIGURES
 from train.physics.contact import BARE, ContactSolver
@@ -38,8 +37,7 @@ _WIDE: Final = 27  # with those beside it, which earlier taps may see
 _ROUNDS, _STEPS = 4, 150
 _SMALL_MPA: Final = 1e-3  # load in proportion to which a pad reads
 _NOISE_COUNTS: Final = 6.0
-_SPREAD, _FREE = 3.0, 0.3
-"""Deviations of a cell's pressure and of its free traction over the mean pressure; chosen on presses of other pads."""
+_SPREAD, _FREE = 3.0, 0.3  # deviations of a cell's pressure and free traction over the mean pressure
 _MOST_SLIP: Final = 1.2
 _KNOWN_GAIN_ERROR: Final = 0.02  # that of the operators, where gains are known
 _SEED: Final = 8_200_201

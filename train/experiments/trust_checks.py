@@ -1,41 +1,43 @@
-"""Checks of patterns by the shipped models, through the runtime: wrong patterns, false alarms, faults, foreign taps.
+"""Checks of patterns by the shipped models, through the runtime: wrong patterns, false alarms, faults of a sensor.
 
-What is judged here has set nothing: networks, checks and limits were fitted on other pads' presses.
+Faults are the same in all contacts of a sensor: fields near the pad, wrong places and axes, and wrong gains.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from edge.evaluation.metrics import psnr_db
 from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
-from edge.perception.runtime import Model
+from edge.perception.result import NOISE_COUNTS, Result
+from edge.perception.runtime import Model, Runtime
 from edge.terminal.progress_bar import tracked
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.scans.scan import ScanSeries
+from firmware_bridge.zeroing.baseline import Baseline
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.presses import SEED
 from train.data.real_grips import play, recorded_grips, recording_paths, recordings_folder
 from train.data.world import World
 from train.errors import CheckpointError
-from train.experiments.sensor_faults import FAULTS, FIELDS, PushedSensor
 from train.experiments.workbench import Workbench, known_pads
 from train.families.family_shares import SHARES
-from train.physics.gripped import MAX_INDENTATION_MM
-from train.report import Report, Row, bootstrap_interval, with_interval
+from train.learning.checks import magnet_field
+from train.networks.symmetric import symmetries
+from train.report import Report, Row, bootstrap_interval
 
 JUDGED: Final = World(count=8000, per_pad=4, families=dict.fromkeys(SHARES, 1.0), seed=7_700_103)
 _MODELS: Final = ("stsr", "mtsr", "stsr-small")
 
 
 def trust_checks(bench: Workbench, report: Report) -> None:
-    """Count patterns not believed and taps dropped, rightly and wrongly; CheckpointError if a model has no checks."""
+    """Count patterns not believed, rightly and wrongly; CheckpointError if a model has no checks."""
     model = bench.model()
     models = [bench.model(f"{name}{INT8_SUFFIX}") for name in (_MODELS[:2] if bench.quick else _MODELS)]
     for one in models:
@@ -57,7 +59,6 @@ def trust_checks(bench: Workbench, report: Report) -> None:
     if recording_paths(recordings_folder()):
         report.table(_grips(models), _GRIPS)
     report.table(_detected(model, sensors), _DETECTED)
-    report.table(_taps(model, bench.models / f"{_MODELS[1]}{INT8_SUFFIX}.onnx", firm(sensors)), _GUARDED)
 
 
 _METHOD: Final = (
@@ -77,8 +78,8 @@ _GRIPS: Final = (
 _DETECTED: Final = (
     "Faults of a sensor, the same in all of its contacts, eleven a sensor, of the wide test set. Fields have 150 to"
     " 1500 counts on the reading where they are largest, and come after zeroing. `another pad's file`: constants "
-    "and gains of another sensor, stated as certain. `sensor, after n`: sensors that n contacts have made "
-    "suspected. 95 % intervals are by sensor; where all are alike, Clopper and Pearson's."
+    "and gains of another sensor, stated as certain. `sensor, after 10`: sensors that ten contacts have "
+    "made suspected. 95 % intervals are by sensor; where all are alike, Clopper and Pearson's."
 )
 
 
@@ -121,25 +122,20 @@ def _detected(model: ModelSession, sensors: FrozenPresses) -> list[Row]:
     return [{"fault": name} | verdicts_on(model, *one) for name, one in tracked(given.items(), "faults", "fault")]
 
 
-AFTER: Final = (1, 3, 5, 10)  # contacts after which the running evidence is looked at
-CONTACTS: Final = max(AFTER) + 1  # contacts of each sensor; the evidence of one is weighed when the next begins
-_OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad")
-"""Reasons that a scan gives by itself."""
-RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0
-"""RMS error over the RMS of the truth: below the first a pattern is right, above the others wrong and far off."""
+AFTER: Final = 10  # contacts after which a sensor may be suspected
+CONTACTS: Final = AFTER + 1  # of each sensor; the evidence of one is weighed when the next begins
+_OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad")  # reasons of a scan by itself
+RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0  # RMS error over the RMS of the truth: right below, wrong and far off above
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Contacts of n sensors, one each, which the runtime checked, at an index (n,) among the presses.
+    """Contacts of n sensors, one each, which the runtime checked."""
 
-    `off` is the RMS error over the RMS of the truth; `light` are those between the counts that end and begin a contact.
-    """
-
-    index: NDArray[np.int64]
-    off: NDArray[np.float64]
+    index: NDArray[np.int64]  # (n,) among the presses
+    off: NDArray[np.float64]  # RMS error over the RMS of the truth
     believed: NDArray[np.bool_]
-    light: NDArray[np.bool_]
+    light: NDArray[np.bool_]  # between the counts that end and begin a contact
 
     def cells(self, here: NDArray[np.bool_]) -> Row:
         """Return the shares of those `here` (n,) that are not believed as cells of a row."""
@@ -184,10 +180,9 @@ def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Seq
     """Return the verdicts on each sensor's contacts (n, 3, rows, cols) in their order, with what its file holds.
 
     They are shares of the contacts, of which too light ones are not checked, and of the sensors with more contacts than
-    each number of AFTER that were suspected by then, as cells of a row.
+    AFTER that were suspected by then, as cells of a row.
     """
-    rows: list[tuple[int, str, bool]] = []
-    suspected: dict[int, list[bool]] = {number: [] for number in AFTER}
+    rows, suspected = list[tuple[int, str, bool]](), list[bool]()
     for number, (contacts, pad) in enumerate(zip(sensors, pads, strict=True)):
         pushed, seen = PushedSensor(model, pad, seed=number), 0
         for counts in contacts:
@@ -196,8 +191,8 @@ def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Seq
                 continue
             rows.append((number, result.untrusted_reason or "", result.trusted is not None))
             pushed.free()  # it brings the events of the contact, which follow from the evidence of those before
-            if seen in suspected:
-                suspected[seen].append(pushed.suspected)
+            if seen == AFTER:
+                suspected.append(pushed.suspected)
             seen += 1
     if not rows:
         return {"contacts": 0}
@@ -205,7 +200,7 @@ def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Seq
     flagged = share(np.isin(reason, _OWN), sensor)
     row: Row = {"contacts": len(rows), "too light": int((~checked).sum()), "flagged %": flagged}
     row |= {f"{name} %": round(100 * float((reason == name).mean()), 1) for name in _OWN[1:]}
-    return row | {f"sensor, after {number} %": share(np.array(some)) for number, some in suspected.items() if some}
+    return row | {f"sensor, after {AFTER} %": share(np.array(suspected)) if suspected else None}
 
 
 def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> Judged:
@@ -224,81 +219,123 @@ def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> 
     return Judged(*map(np.array, zip(*rows, strict=True)))
 
 
-_DEPTHS: Final = (0.85, 1.15)
-_GUARDED: Final = (
-    "Windows of four taps: share of each earlier one that the runtime finds not to belong, newest first; of windows of "
-    "which it drops some, and all. In the row `right` these are false alarms, wanted at most 1 %; in the others at "
-    "least 95 % are wanted. The order reversed leaves the middle tap right. Then the PSNR in dB by the model of one "
-    "tap, and by that of four without and with the guard. Wanted: with it, never more than 0.3 dB below one tap. "
-    "Intervals are by sensor; guard and options are as shipped, and every tap is used."
+Counts = NDArray[np.float32]  # readings of one sensor, (n, 3, rows, cols), zeroed
+Fault = Callable[[np.random.Generator, Counts], Counts]  # readings of one sensor as a fault changes them
+Field = Callable[[np.random.Generator], Counts]
+"""Counts (3, rows, cols) that something near the pad adds to each reading."""
+
+_MAGNET_MM, _CHIP_MM, _PAD_TOP_MM = 2.5, 0.5, 4.5
+_MOVES: Final = (
+    *("turned by 90 degrees", "turned by 180 degrees", "turned by 270 degrees"),
+    *("mirrored", "mirrored and turned by 90", "mirrored and turned by 180", "mirrored and turned by 270"),
 )
 
 
-def _taps(single: ModelSession, several: Path, sensors: FrozenPresses) -> list[Row]:
-    guarding, unguarded = (ModelSession(several, taps=4) for _ in range(2))
-    unguarded.contract = replace(unguarded.contract, trust={})
-    taps, name = guarding.contract.taps, guarding.name
-    pads, rows = sensors.presses.pad, list[Row]()
-    for case, (counts, truth) in tracked(cases(sensors).items(), "tapping", "case"):
-        alone_db, _, _ = guarded(single, counts, truth, 1)
-        off_db, _, _ = guarded(unguarded, counts, truth, taps)
-        on_db, used, foreign = guarded(guarding, counts, truth, taps)
-        row: Row = {"earlier taps": case, "windows": len(counts)}
-        row |= {f"tap {number} %": share(foreign[:, number - 1], pads) for number in range(1, taps)}
-        row["some dropped %"] = share(np.logical_or.reduce(foreign, axis=1), pads)
-        row |= {"all dropped %": share(used == 1, pads), single.name: round(float(alone_db.mean()), 2)}
-        for how, found_db in (("no guard", off_db), ("guard", on_db)):
-            row[f"{name}, {how}"] = round(float(found_db.mean()), 2)
-            row[f"{how}, over one tap"] = with_interval(found_db - alone_db, pads, sign="+")
-        rows.append(row)
-    return rows
+def steel_field(rng: np.random.Generator) -> NDArray[np.float32]:
+    """Draw the counts (3, rows, cols) that a steel plate above the pad adds: images of the pad's own magnets.
 
-
-def firm(sensors: FrozenPresses) -> FrozenPresses:
-    """Return the sequences whose taps all begin a contact, at the least depth of `cases` too."""
-    z_counts = sensors.presses.counts[:, :, 2].sum(axis=(2, 3))
-    return sensors.pick((_DEPTHS[0] * z_counts > ON_COUNTS * 1.05).all(axis=1))
-
-
-def cases(sensors: FrozenPresses) -> dict[str, tuple[NDArray[np.floating], NDArray[np.float32]]]:
-    """Return right windows (n, K, 3, rows, cols) and wrong ones, by name, with the truths of their newest taps."""
-    counts, truth = sensors.presses.counts, sensors.patterns()
-    newest, earlier = counts[:, :1], counts[:, 1:]
-    rng = np.random.default_rng(17)
-    depths = rng.uniform(*_DEPTHS, (*earlier.shape[:2], 1, 1, 1)).astype(np.float32)
-    mirrored = counts[..., ::-1] * np.array([-1, 1, 1], dtype=np.float32)[:, None, None]
-    other = next_of_pad(sensors.presses.pad)
-    return {
-        "right": (counts, truth),
-        "another surface": (np.concatenate([newest, earlier[other]], axis=1), truth),
-        "order reversed": (np.concatenate([newest, earlier[:, ::-1]], axis=1), truth),
-        # The mirror image of a pad that turns one way is one that turns the other way.
-        "turned the other way": (mirrored, truth[..., ::-1]),
-        "not turned": (np.concatenate([newest, newest * depths], axis=1), truth),
-    }
-
-
-def next_of_pad(pads: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Return for each press the next one of its pad, or of all where the pad has one alone, (n,)."""
-    result = np.roll(np.arange(len(pads)), -1)
-    for pad in np.unique(pads):
-        mine = np.flatnonzero(pads == pad)
-        if len(mine) > 1:
-            result[mine] = np.roll(mine, -1)
-    return result
-
-
-def guarded(
-    model: Model, windows: NDArray[np.floating], truth: NDArray[np.float32], taps: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Push each window through a runtime of its own, the newest tap being inferred.
-
-    Returns the PSNR (n,) in [dB], the taps used (n,), and which earlier ones do not belong, (n, K - 1).
+    The image of an upright magnet in a plate is upright too, as far above the plate as the magnet is below. The plate
+    is wider than the pad, leans by up to eleven degrees, and its largest count is drawn, as a far magnet's is.
     """
-    patterns, used, foreign = [], [], []
-    for number, counts in enumerate(windows):
-        result = PushedSensor(model, seed=number).tap(counts[:taps])
-        patterns.append(np.asarray(result.pattern))  # there is one, since taps that begin no contact are left out
-        used.append(result.taps_used)
-        foreign.append([mismatch >= 0.5 for mismatch in result.tap_mismatch or ()])
-    return psnr_db(np.stack(patterns), truth, MAX_INDENTATION_MM), np.array(used), np.array(foreign, dtype=bool)
+    across_mm = (np.arange(USPA44.cols) - (USPA44.cols - 1) / 2) * USPA44.pitch_mm
+    x_mm, y_mm = (part.ravel() for part in np.meshgrid(across_mm, across_mm))
+    slope = rng.uniform(-0.2, 0.2, 2)
+    lean_mm = slope[0] * x_mm + slope[1] * y_mm
+    gap_mm = rng.uniform(1.0, 8.0) + lean_mm - lean_mm.min()
+    image_mm = 2 * (_PAD_TOP_MM + gap_mm) - _MAGNET_MM
+    away = np.stack(
+        [x_mm[:, None] - x_mm, y_mm[:, None] - y_mm, np.broadcast_to(_CHIP_MM - image_mm, (16, 16))]
+    )  # (3, chips, images)
+    square = (away**2).sum(axis=0)
+    field = 3 * away * away[2] / square**2.5
+    field[2] -= square**-1.5
+    total = field.sum(axis=2).reshape(USPA44.scan_shape)
+    return (total / np.abs(total).max() * rng.uniform(150.0, 1500.0)).astype(np.float32)
+
+
+def _added(field: Field) -> Fault:
+    return lambda rng, counts: counts + field(rng)
+
+
+def _moved(number: int) -> Fault:
+    return lambda rng, counts: np.ascontiguousarray(symmetries("p4m")[number](counts), dtype=np.float32)
+
+
+def _places(order: Callable[[np.random.Generator], NDArray[np.integer]]) -> Fault:
+    """Return the fault by which taxels are at other places, the same for all axes."""
+    return lambda rng, counts: counts.reshape(*counts.shape[:2], -1)[:, :, order(rng)].reshape(counts.shape)
+
+
+def _neighbours(rng: np.random.Generator) -> NDArray[np.integer]:
+    order = np.arange(USPA44.taxel_count)
+    row, col = rng.integers(USPA44.rows), rng.integers(USPA44.cols - 1)
+    taxel = row * USPA44.cols + col
+    order[[taxel, taxel + 1]] = taxel + 1, taxel
+    return order
+
+
+def _axes(order: tuple[int, int, int], signs: tuple[int, int, int] = (1, 1, 1)) -> Fault:
+    return lambda rng, counts: counts[:, order] * np.array(signs, dtype=np.float32)[:, None, None]
+
+
+def _gains(rng: np.random.Generator, counts: Counts) -> Counts:
+    return counts * (1 + 0.25 * rng.standard_normal(counts.shape[1:])).astype(np.float32)
+
+
+_GRID: Final = np.arange(USPA44.taxel_count).reshape(USPA44.rows, USPA44.cols)
+FIELDS: Final[dict[str, Field]] = {
+    "a magnet near the pad": lambda rng: magnet_field(rng, 1)[0],
+    "a steel plate near the pad": steel_field,
+}
+FAULTS: Final[dict[str, Fault]] = {
+    **{name: _added(field) for name, field in FIELDS.items()},
+    **{f"places {name}": _moved(number) for number, name in enumerate(_MOVES, 1)},
+    "rows exchanged in pairs": _places(lambda rng: _GRID[[1, 0, 3, 2]].ravel()),
+    "columns exchanged in pairs": _places(lambda rng: _GRID[:, [1, 0, 3, 2]].ravel()),
+    "places shuffled": _places(lambda rng: rng.permutation(USPA44.taxel_count)),
+    "two neighbours exchanged": _places(_neighbours),
+    "x and y exchanged": _axes((1, 0, 2)),
+    "x and z exchanged": _axes((2, 1, 0)),
+    "y and z exchanged": _axes((0, 2, 1)),
+    "x turned": _axes((0, 1, 2), (-1, 1, 1)),
+    "y turned": _axes((0, 1, 2), (1, -1, 1)),
+    "x and y turned": _axes((0, 1, 2), (-1, -1, 1)),
+    "gains off by a quarter": _gains,
+}
+
+
+SHIPPED: Final = RuntimeOptions(follow_drift=False)
+"""Options of the shipped runtime, but for the rest level, which follows a pad that is free for longer than here."""
+_REST: Final = np.array((16_000, 16_400, 38_600), dtype=np.int32)[:, None, None] * np.ones((1, 4, 4), dtype=np.int32)
+_SENSOR: Final = "4"
+
+
+class PushedSensor:
+    """Sensor whose scans go through a runtime of its own; `suspected` if the last scan's events leave it so."""
+
+    def __init__(self, model: Model, pad: Pad | None = None, seed: int = 0, options: RuntimeOptions = SHIPPED) -> None:
+        baseline = Baseline.of(_SENSOR, _REST.astype(np.float32), created_unix_s=0.0, scans=100, origin="start-up")
+        self._runtime = Runtime(model, source="replay", baselines={_SENSOR: baseline}, pad=pad, options=options)
+        self._series = ScanSeries(_SENSOR, USPA44)
+        self._rng = np.random.default_rng([seed, 11])
+        self._time_ns = 0
+        self.suspected = False
+
+    def free(self) -> None:
+        """Push the noise of a free pad."""
+        for _ in range(2):
+            self.push(NOISE_COUNTS * self._rng.standard_normal(USPA44.scan_shape, dtype=np.float32))
+
+    def push(self, counts: NDArray[np.floating]) -> Result:
+        """Return the result of the next scan, of zeroed counts (3, rows, cols)."""
+        self._time_ns += 10_000_000
+        raw = np.clip(_REST + np.rint(counts).astype(np.int32), 1, 65_534)
+        result = self._runtime.push(self._series.close(raw, self._time_ns))
+        for event in result.events:
+            self.suspected = event.kind == "suspected" or (self.suspected and event.kind != "cleared")
+        return result
+
+    def touch(self, counts: NDArray[np.floating]) -> Result:
+        """Return the result of one scan of a contact on a pad that was free before."""
+        self.free()
+        return self.push(counts)

@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.flop_counter import FlopCounterMode
 
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL
@@ -25,7 +24,6 @@ from train.data.world import World
 from train.freeze import freeze
 from train.learning.checkpoint import Training, fit_network, load_network
 from train.learning.checkpoint import infer as infer_network
-from train.networks.blocks import PatternNet
 from train.physics.gripped import FRAMES, SCALE
 from train.report import Report, Row
 from train.surfaces.named_surfaces import SURFACES
@@ -34,9 +32,6 @@ from train.surfaces.poses import ANGLE_STEP_DEG, Split
 _TIMED_RUNS: Final = 12  # of which the first third is left out
 _frozen = cache(freeze)  # which takes minutes, and several experiments want the same
 _QUICK_PRESSES: Final = 42
-
-Figures = dict[str, NDArray[np.float64]]
-"""Every metric of every frame, (n,) each, as returned by edge.evaluation.evaluate."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +42,7 @@ class Method:
     taps: int  # of a window that the method uses
     contact_level: float  # share of a pattern's maximum from which a pixel counts as touched
     run: Callable[[NDArray[np.float32]], NDArray[np.floating]]
-    cost: Row = field(default_factory=dict)  # parameters, multiply-accumulates and run time, as cells of a row
-    training: Row = field(default_factory=dict)  # steps and time, as cells of a row
+    cost: Row = field(default_factory=dict)  # parameters and run time, as cells of a row
 
     def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
         """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
@@ -73,7 +67,6 @@ class Workbench:
     def presses(self, name: str, world: World, quick_taps: int = 1) -> PressSet:
         """Return the presses of that world, read if they exist, else made; in a quick run a few of `quick_taps`."""
         if self.quick:
-            name = f"quick-{name}"
             world = replace(world, count=_QUICK_PRESSES, taps=quick_taps, per_pad=_QUICK_PRESSES // 2)
         self.data_folder.mkdir(parents=True, exist_ok=True)
         return make_presses(world, self.data_folder / f"{name}.npz")
@@ -90,7 +83,8 @@ class Workbench:
     def fit(self, training: Training, data: PressSet, validation: FrozenSet) -> Path:
         """Return the checkpoint of a network, which is trained unless the same training on these data exists."""
         if self.quick:
-            training = _quick(training)
+            options = {"channels": 16, "blocks": 1} if training.network.startswith(("compact", "fusion")) else {}
+            training = replace(training, recipe=replace(training.recipe, steps=1, batch=2), options=options)
         fit_network(training, data, validation, self.checkpoints)
         return self.use(self.checkpoints / f"{training.name}.pt")
 
@@ -98,14 +92,13 @@ class Workbench:
         """Return a trained network; the one that it starts from must be there."""
         path = self.fit(training, data, validation)
         net, report = load_network(path)
-        steps, elapsed_s, level = report["steps"], report["elapsed_s"], report["contact_level"]
-        while (start := report["config"]["start"]) is not None:  # its training counts as well
-            _, report = load_network(self.checkpoints / f"{start}.pt")
-            steps, elapsed_s = steps + report["steps"], elapsed_s + report["elapsed_s"]
-        cells: Row = {"steps": steps, "training min": round(elapsed_s / 60, 1)}
-        return Method(
-            path.stem, net.taps, level, lambda given: infer_network(net, given)[0], _cost_of_network(net), cells
-        )
+        window = torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:])
+        with one_thread(), torch.inference_mode():
+            cost: Row = {
+                "parameters": sum(parameter.numel() for parameter in net.parameters()),
+                "run time ms": median_ms(lambda: net(window)),
+            }
+        return Method(path.stem, net.taps, report["contact_level"], lambda given: infer_network(net, given)[0], cost)
 
     def frozen(
         self,
@@ -119,38 +112,13 @@ class Workbench:
         return frozen.thinned(FRAMES) if self.quick else frozen  # one frame a tap
 
 
-def _cost_of_network(net: PatternNet) -> Row:
-    """Return parameters, multiply-accumulates, and run time of one window in torch on one thread, as cells of a row."""
-    window = torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:])
-    with one_thread(), torch.inference_mode():
-        run_time_ms = median_ms(lambda: net(window))
-    parameters = sum(parameter.numel() for parameter in net.parameters())
-    return {"parameters": parameters, "MMAC": round(macs(net) / 1e6, 1), "run time ms": run_time_ms}
-
-
 def median_ms(run: Callable[[], object]) -> float:
     """Return the median time of some runs, without the first third of them, in [ms]."""
     times_s = repeat(run, number=1, repeat=_TIMED_RUNS)
     return round(1e3 * float(np.median(times_s[_TIMED_RUNS // 3 :])), 3)
 
 
-def _quick(training: Training) -> Training:
-    """Return the training in miniature, under its own name."""
-    recipe = replace(training.recipe, steps=1, batch=2)
-    options = {"channels": 16, "blocks": 1} if training.network.startswith(("compact", "fusion")) else {}
-    start = training.start and f"quick-{training.start}"
-    return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
-
-
-def macs(net: PatternNet) -> int:
-    """Count multiply-accumulates of one window in convolutions and matrix products, without norms and interpolation."""
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        net.eval()(torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:]))
-    return counter.get_total_flops() // 2
-
-
-SHORT: Final = {False: "model", True: "model, all known"}
-"""Names of a model that is told nothing of a sensor, and of one that is told its pad's constants and its gains."""
+SHORT: Final = {False: "model", True: "model, all known"}  # told nothing of a sensor, or its constants and gains
 
 
 class Inferred(NamedTuple):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from firmware_bridge.pad_geometry import USPA44
-from train.experiments.half_space import draw_presses, movement, places, pressed
+from train.experiments.second_world import draw_presses, movement, places, pressed
 
 CELLS, RADIUS_MM, DEPTH_MM = 34, 4.0, 0.3
 CELL_MM = USPA44.width_mm / CELLS
