@@ -1,8 +1,4 @@
-"""Recordings as a controller would send them: of the demo, and of two fingers that grip things.
-
-In the demo a surface is tapped by the paper's schedule, another one among these taps, a magnet comes near, and the pad
-slides. The grips have noise, drift, gains and uneven pads of real sensors.
-"""
+"""Recordings as a controller would send them: of the demo, and of two fingers that grip things."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -29,8 +25,7 @@ from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, figure
 from train.surfaces.poses import ANGLE_STEP_DEG, PLACES_MM
 
-SURFACE: Final = "glyph:1"
-"""A random figure, which no network was trained on: of those of the paper one tap shows nearly all."""
+SURFACE: Final = "glyph:1"  # a figure that no network was trained on: of those of the paper one tap shows nearly all
 FOREIGN: Final = "small circle"
 _PLACE_MM: Final = PLACES_MM["test"]
 ANGLE_DEG: Final = 30.0  # angle of the last scored tap; each tap before is a step back, each later one a step on
@@ -39,20 +34,20 @@ FORCE_N: Final = 5.0
 RATE_HZ: Final = 100.0
 REST_FRAMES, PRESS_FRAMES, HOLD_FRAMES, LIFT_FRAMES, GAP_FRAMES, STILL_FRAMES = 150, 20, 24, 12, 24, 30
 TAP_FRAMES: Final = PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES + GAP_FRAMES
-MAGNET_FRAMES, MAGNET_ALONE_FRAMES = 80, 30
-"""Frames in which the magnet comes near, and in which it leaves, and for which it stays before the pad is tapped."""
+MAGNET_FRAMES, MAGNET_ALONE_FRAMES = 80, 30  # in which it comes, and leaves; for which it stays before a tap
 _TOWARDS: Final = (0.5, -0.3, 0.8)
 _MOMENT: Final = (-0.3, -0.8, 0.5)
 FOREIGN_SCENE, MAGNET_SCENE, SLIDE_SCENE = 0, 1, 2
+# Width of the long letter, which one lane of the pad covers, and its place in the object's plane, beside the taps.
 LETTER_WIDTH_MM, LETTER_Y_MM, LETTER_PX_PER_MM = 14.0, 60.0, 4.0
-"""Width of the long letter, which one lane of the pad covers, and its place in the object's plane, beside the taps."""
 FIGURE_MM: Final = 50.0  # longest side of the long letter
 HALF_LENGTH_MM: Final = 30.0
 _RASTER_MM: Final = 0.05
 _INDENTATION_MM: Final = (0.15, 0.4)
 _AT_ONCE: Final = 50
+_HEAD: Final = {"format": np.array(NPZ_FORMAT), "version": np.array(NPZ_VERSION), "rate_hz": np.array(RATE_HZ)}
+# The zero is a second old: no drift yet, and the pad has not moved in the earth's field.
 _SENSOR: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
-"""The zero is a second old: no drift yet, and the pad has not moved in the earth's field."""
 
 
 def demo_recording() -> dict[str, NDArray]:
@@ -91,9 +86,7 @@ def demo_recording() -> dict[str, NDArray]:
     share[scored], number[scored] = np.tile(_course(), TAPS), np.repeat(np.arange(TAPS), TAP_FRAMES)
     tapped = [_stated(0, 0, angles_deg[0] - angle) for angle in (*angles_deg, *later_deg[:3])]
     return {
-        "format": np.array(NPZ_FORMAT),
-        "version": np.array(NPZ_VERSION),
-        "rate_hz": np.array(RATE_HZ),
+        **_HEAD,
         "sensor": np.full(len(share), "4"),
         "scan": np.arange(len(share)),
         "time_ns": (np.arange(len(share)) * 1e9 / RATE_HZ).astype(np.int64),
@@ -236,8 +229,8 @@ _STEP: Final = 5  # scans from one solved press to the next; those between are i
 _FORCE_N: Final = 8.0
 _DRIFT_COUNTS_PER_S: Final = 2.0  # of z, as a pad warms in a grip
 
+# Height in [mm] at places of x and y in [mm], as one finger sees it.
 Shape = Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.floating]]
-"""Height in [mm] at places of x and y in [mm], as one finger sees it."""
 
 
 def _pen(x_mm: NDArray[np.floating], y_mm: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -255,9 +248,7 @@ def grip_recording() -> dict[str, NDArray]:
     scans = len(fingers[0])
     time_ns = np.arange(scans) * 1e9 / RATE_HZ
     return {
-        "format": np.array(NPZ_FORMAT),
-        "version": np.array(NPZ_VERSION),
-        "rate_hz": np.array(RATE_HZ),
+        **_HEAD,
         "origin": np.full(scans * len(FINGERS), "emulated"),
         "sensor": np.tile(FINGERS, scans),
         "scan": np.repeat(np.arange(scans), len(FINGERS)),
@@ -272,9 +263,8 @@ def _finger(number: int) -> NDArray[np.float64]:
     pad = GrippedPad(draw_pad(rng))
     free = np.zeros((_FREE, *USPA44.scan_shape))
     clean = np.concatenate([free, *(part for shape in (_pen, _nut) for part in (_grip(pad, shape, number == 1), free))])
-    sensor = Nuisances().without("thermal_drift_counts", "earth_field_counts")  # zeroed a second ago, in this place
     duration_s = len(clean) / RATE_HZ
-    read = apply_nuisances(clean[None, None].astype(np.float32), sensor, int(rng.integers(2**31)), tap_s=duration_s)
+    read = apply_nuisances(clean[None, None].astype(np.float32), _SENSOR, int(rng.integers(2**31)), tap_s=duration_s)
     warming = np.array([0.0, 0.0, 1.0])[:, None, None] * _DRIFT_COUNTS_PER_S * rng.uniform(0.5, 1)
     drift = np.linspace(0, duration_s, len(clean))[:, None, None, None] * warming
     rest = np.array([32700.0, 32800.0, 37400.0])[:, None, None] + 300.0 * rng.standard_normal(USPA44.scan_shape)

@@ -5,9 +5,7 @@
 With `torchrun --nproc-per-node 2 -m train.fit` two processes share each batch.
 
 The bundled networks are trained for as many steps, that of one tap and that of several taps, so that taps alone tell
-them apart. Older taps and the pads' constants are dropped at random in training, so that a network works with fewer
-taps than it takes and without constants. An interrupted run resumes with the same command. NAME.json, next to the
-weights, has the loss by steps.
+them apart. An interrupted run resumes with the same command. NAME.json, next to the weights, has the loss by steps.
 """
 
 import argparse
@@ -25,9 +23,8 @@ from train.networks.named_networks import NETWORKS
 from train.physics.pad_draws import KNOWN
 from train.surfaces.poses import MAX_TAPS
 
+# Share of windows with 1, 2, ... K taps; of batches, for a network that takes poses.
 GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45), 7: (0.3, 0.14, 0.1, 0.25, 0.04, 0.04, 0.13)}
-"""Share of windows with 1, 2, ... K taps; of batches, for a network that takes poses."""
-
 _KNOWN: Final = {"known": KNOWN}
 _COMPACT: Final = ("compact-", "small-", "fusion-")  # networks that take constants of the pad and give deviations
 

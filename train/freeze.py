@@ -1,6 +1,6 @@
-"""Make the data that come with the models: the frozen test set, classical methods, taxels' covariance, a recording.
+"""Make the data that come with the models: the frozen test set, classical methods, taxels' covariance, recordings.
 
-python -m train.freeze edge/models --data data/gripped.npz data/gripped4.npz
+    python -m train.freeze edge/models --data data/gripped.npz
 
 An existing frozen test set is kept, because models name it by its hash and processors round differently: delete it
 to freeze it again.
@@ -36,16 +36,10 @@ from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, PLACES_MM, TARGET_ANGLES_DEG, Split
 
-TEST_FORCE_N: Final = 5.0
-"""Force at which every tap of a frozen set ends, unless the sensor's largest depth is reached before, in [N]."""
+TEST_FORCE_N: Final = 5.0  # at which every tap of a frozen set ends, unless the largest depth is reached before
 CLASSICAL_WINDOWS: Final = 12_000
-KINDS: Final = 16
-"""Number of kinds of contact. RMS error of a hidden taxel's z over that of the scan is 0.61 with 1 and 0.56 with 16.
-
-More kinds reduce it on figures, but not on contacts that vary little over the pad.
-"""
-FIRST_FRAME: Final = 6
-"""Frames of a press before the first one kept: kept frames begin at about 30 % of the set force, as in the paper."""
+KINDS: Final = 16  # of contact: with more the error of a hidden taxel is less on figures alone
+FIRST_FRAME: Final = 6  # frames of a press before those that are kept, from 30 % of the set force on, as in the paper
 _PRESSED_TO_N: Final = 9.2  # force at which presses end; their courses lead to TEST_FORCE_N
 _AT_ONCE: Final = 48  # sequences whose pose errors are drawn at once: so the bundled frozen set has its poses
 
@@ -137,10 +131,7 @@ def fit_kinds(readings: NDArray[np.floating], kinds: int = KINDS) -> NDArray[np.
 
 
 def drawn(taps: PressSet, windows: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return readings (n, 3, rows, cols) of newest taps in zeroed counts, with a different sensor each, and patterns.
-
-    No taxel is dead, because the fits are to learn the readings of healthy ones. Patterns are (n, H, W) in [mm].
-    """
+    """Return zeroed readings (n, 3, rows, cols) by different, healthy sensors, and patterns (n, H, W) in [mm]."""
     index = np.random.default_rng(SEED).permutation(len(taps))[np.arange(windows) % len(taps)]
     newest = taps.with_taps(1).pick(index)
     return read_presses(newest, Nuisances(), SEED)[:, 0], newest.patterns.astype(np.float32)

@@ -3,10 +3,9 @@
     python -m train.identify recordings --out sensor.toml
     python -m train.identify ball.mcap --ball-mm 40 --out sensor.toml
 
-RECORDINGS is a folder of TRIAL/xela_SENSOR.csv; one trial has to end with a free pad, from which all are zeroed.
-Constants that contacts determine are written into the sensor file's [pad] section with their 90 % intervals; constants
-that remain as open as the range of simulated pads are left out. With --ball-mm it is one recording in which a ball of
-that diameter was pressed onto the pad several times, after a weight was laid on it.
+RECORDINGS is a folder of TRIAL/xela_SENSOR.csv; one trial has to end with a free pad, from which all are zeroed. With
+--ball-mm it is one recording in which a ball of that diameter was pressed onto the pad several times. Constants that
+these determine are written into the sensor file's [pad] section with their 90 % intervals.
 """
 
 import argparse
@@ -49,10 +48,7 @@ def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def contact_pads(folder: Path, file: SensorFile) -> dict[str, tuple[str, Pad]]:
-    """Return of each sensor of a folder how many distinct contacts it has, and its pad by them.
-
-    DatasetError if there are none, or a recording cannot be read or is not of the file's sensor.
-    """
+    """Return of each sensor of a folder how many distinct contacts it has, and its pad; DatasetError if none."""
     model, told = load_contact_model(CONTACTS), {}
     for sensor, counts in recorded_contacts(folder, file).items():
         if len(dead := np.flatnonzero((np.ptp(counts, axis=0) == 0).all(axis=0))):
@@ -70,7 +66,6 @@ def ball_pads(path: Path, diameter_mm: float, file: SensorFile) -> dict[str, tup
 
     A constant of the sensor file without an interval was entered by a person: it is taken as known, and kept. One with
     an interval was measured, and is measured anew: taken as known, the same presses would count again with each call.
-
     RecordingError, BaselineRefusedError or DatasetError if there are too few, or they are not of that ball.
     """
     recording, pads = load_recording(path), {}

@@ -3,15 +3,10 @@
     python -m train.own sensor.toml --recordings trials --mesh part.stl --minutes 60 --out mine
     python -m train.own sensor.toml --taps taps.npz --beside mine/mine.onnx --out tapped
 
-The bundled models are for any pad. One for a single pad is better by decibels, and worse than none on another pad: so
-its pads are drawn within what is known of the sensor, the less is known the wider, and the model says in its contract
-whose it is. Constants that the sensor file lacks are found by train.identify, which adds them to it.
-
-At the end it is compared with the bundled model, which is told the same, and with bilinear interpolation, on presses of
-pads like the sensor, of pads a little unlike it, and on --recordings, a folder of TRIAL/xela_SENSOR.csv. What loses is
-not handed over, nor what is worse than the model that is there, nor a gain in the mean that too many of the pads in
-question do not have. The same command continues an interrupted run. Taps of train.taps are a third of what it then
-learns from; those held out decide, also against models --beside it.
+A model for one pad is worse than none on another: so its pads are drawn within what is known of the sensor, and its
+contract says whose it is. At the end it is compared with the bundled model, which is told the same: what loses is not
+handed over, nor what is worse than the model that is there, nor a gain in the mean that too many of the pads in
+question do not have.
 """
 
 import argparse
@@ -106,9 +101,7 @@ def _within(name: str, low: float, high: float) -> tuple[float, float]:
 def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
     """Return what a sensor file tells of a sensor, whose name may be left out of a file of one.
 
-    Raises:
-        DatasetError: no such sensor, several of them, an emulated one, of which nothing holds for a device, or one that
-            cannot be simulated.
+    DatasetError if there is no such sensor, or it is emulated (nothing of it holds for a device) or beyond simulation.
     """
     if file.geometry != USPA44:
         raise DatasetError(f"the sensor file is of a {file.geometry.name}, expected a {USPA44.name}")
@@ -187,12 +180,9 @@ def compared(
 ) -> Comparison:
     """Compare a model with the bundled one, told the same, and with bilinear interpolation.
 
-    Args:
-        own: the model.
-        knowledge: of its sensor.
-        sets: presses that it was not trained on, by what they are; TAPPED are the sensor's own, read as they are.
-        grips: recordings of the sensor that holds flat faces, which cover its pad.
-        beside: further models by name, which TAPPED decide between; one that is REPLACED must not be the better one.
+    `sets` are presses that it was not trained on, by what they are; TAPPED are the sensor's own, read as they are. They
+    decide between further models `beside` it, of which one that is REPLACED must not be the better one. In `grips` the
+    sensor holds flat faces, which cover its pad.
     """
     bundled = ModelSession(find_model(DEFAULT_MODEL))
     sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled} | dict(beside)

@@ -5,8 +5,7 @@
     python -m train.taps C.npy F.npy --sensor-file sensor.toml --out taps.npz
 
 The poses of a recording say where the pad was, the surface what lay under it, and the constants of the sensor file how
-deep it was pressed where it reads so much. The tactile PSF makes patterns of that, from first touch to full force. Some
-places are held out, and `python -m train.own --taps` learns from the others.
+deep it was pressed where it reads so much. `python -m train.own --taps` learns from the patterns that the PSF makes.
 
 The reach of the PSF is that of the pad's layer, as in all other training. With --truth fitted it is the paper's: a
 network of the PSF is fitted on these very taps. psf and depth, which have no plateau or no reach, are to compare.
@@ -39,8 +38,7 @@ from train.physics.pad_draws import constants
 from train.physics.tpsf import resample_touching, spread, tpsf_pattern
 from train.surfaces.depth_image import Pose
 
-FEWEST: Final = 27
-"""Fewest places to tap: one of each nine is held out for validation and one for the test, as in the paper."""
+FEWEST: Final = 27  # places to tap: one of each nine is held out for validation and one for the test, as in the paper
 EPOCHS: Final = 20  # of the network of the PSF
 TRUTHS: Final = ("tpsf", "fitted", "psf", "depth")
 _IMAGE_MM: Final = USPA44.rows * USPA44.pitch_mm  # side of a published depth image: the taxels' area
@@ -50,7 +48,7 @@ _IMAGE_MM: Final = USPA44.rows * USPA44.pitch_mm  # side of a published depth im
 def tapped(paths: Sequence[Path], surfaces: Sequence[Surface], knowledge: Knowledge, entry: SensorEntry) -> PressSet:
     """Return all frames of the taps in recordings, each of its surface, still without patterns; contact at FINE_SCALE.
 
-    The number of a frame's pad is that of its tap, and the split into training, validation and test is by place.
+    The number of a frame's pad is that of its tap; the split is by place.
     """
     gripped = GrippedPad(knowledge.middle())  # also of what is not known
     gains = np.reshape(knowledge.pad.gains or np.ones(USPA44.scan_shape), USPA44.scan_shape)

@@ -15,8 +15,7 @@ from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.pad_draws import input_scale, known_numbers
 from train.physics.sensor_noise import NAMES, Nuisances
 
-WIDE_TEST: Final = Path(__file__).with_name("wide-test.npz")
-"""Frozen set of every family on pads of its own, whose facts hold its world; nothing is selected by it."""
+WIDE_TEST: Final = Path(__file__).with_name("wide-test.npz")  # every family on pads of its own; it selects nothing
 _USUAL: Final = Nuisances()
 _BEFORE_GAIN: Final = ("pose_error_mm", "pose_error_deg", "hysteresis", "cross_talk", "gain_spread")
 
@@ -79,10 +78,7 @@ class FrozenPresses:
 
 
 def freeze_presses(presses: PressSet, seed: int, nuisances: Nuisances = _USUAL) -> FrozenPresses:
-    """Read every sequence once, each with a different sensor.
-
-    Gains act where they do in `train.physics.sensor_noise`; they are drawn separately, so that they can be returned.
-    """
+    """Read every sequence once, each with a different sensor, whose gains act where they do in sensor_noise."""
     before = nuisances.without(*(name for name in NAMES if name not in _BEFORE_GAIN), "gain_spread")
     after = nuisances.without(*_BEFORE_GAIN)
     gains = _gains(seed, presses, nuisances.gain_spread)

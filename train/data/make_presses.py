@@ -3,8 +3,7 @@
     python -m train.data.make_presses data/gripped.npz --count 24000
     python -m train.data.make_presses data/parts.npz --mesh part.stl --count 2000
 
-Every pad's presses are solved by one of several processes and written next to the file as they are completed, in
-`data/gripped.npz.parts`; at the end they are joined and removed.
+Every pad's presses are written as they are solved, into `data/gripped.npz.parts`; at the end they are joined.
 """
 
 import argparse

@@ -71,31 +71,21 @@ def in_units(counts: NDArray[np.float32]) -> NDArray[np.float32]:
     return counts / np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
 
 
-_NOTHING: Final = 0.35
-_ALL: Final = 0.35
-"""Shares of windows with no or all constants of the pad as input; in the others each is drawn with probability 0.5."""
+_NOTHING, _ALL = 0.35, 0.35  # shares of windows with no or all constants of the pad as input; else a half of each
+# Share of windows, and the spread of their gains over that of a new sensor: two kinds of new sensors, the second wider
+# than most; of the others calibration leaves a tenth to three fifths, which the certainty of the gains states.
 _GAIN_SPREADS: Final = ((0.4, 1.0), (0.15, 1.6), (0.15, 0.1), (0.15, 0.3), (0.15, 0.6))
-"""Share of windows, and the spread of their gains over that of a new sensor.
-
-The first two are new sensors, the second kind wider than most; in the others calibration leaves a tenth to three fifths
-of the spread, which the certainty of the gains states.
-"""
 _NEW_SENSORS: Final = Nuisances(dead_taxels=0.02)
+_TOLD: Final = 0.75  # share of windows in which a network of one sensor is told of it; else it has to know by itself
 
 
 @dataclass(frozen=True, slots=True)
 class OneSensor:
-    """The one sensor that a network is for.
+    """The one sensor that a network is for."""
 
-    Attributes:
-        row: what the network is told of it, as the runtime makes it from the sensor file, (KNOWN,).
-        gain_spread: spread that is left of its gains once readings were divided by them, over that of a new sensor.
-        made_for: bounds within which its constants and the certainty of its gains are known, by name, as in a contract.
-    """
-
-    row: tuple[float, ...]
-    gain_spread: float
-    made_for: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    row: tuple[float, ...]  # what the network is told of it, as the runtime makes it from the sensor file, (KNOWN,)
+    gain_spread: float  # that is left once readings were divided by its gains, over that of a new sensor
+    made_for: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # as in a contract
 
     @property
     def nuisances(self) -> Nuisances:
@@ -108,15 +98,10 @@ class OneSensor:
         return (told * np.array(self.row)).astype(np.float32)
 
 
-_TOLD: Final = 0.75
-"""Share of windows in which a network of one sensor is told of it; in the others it has to know it by itself."""
-
-
 class PressBatches:
     """Batches of windows, pad inputs, and truth; windows of one tap are mirrored, half of them.
 
-    `given` is the share of windows with 1, 2, ... K taps, whose older taps are dropped.
-    DatasetError if there are no presses of K taps.
+    `given` is the share of windows with 1, 2, ... K taps. DatasetError if there are no presses of K taps.
     """
 
     def __init__(
@@ -154,11 +139,8 @@ class PressBatches:
 def with_own_taps(
     batches: Callable[[int], Batch], taps: PressSet, sensor: OneSensor, seed: int
 ) -> Callable[..., Batch]:
-    """Return batches in which a third of the windows are a sensor's own taps, which no mirror image belongs to.
-
-    Their gains and lags are the sensor's; drift, the earth's field and noise differ from tap to tap. They have no
-    traction.
-    """
+    """Return batches in which a third of the windows are a sensor's own taps, which no mirror image belongs to."""
+    # Their gains and lags are the sensor's; drift, the earth's field and noise differ from tap to tap.
     left = sensor.nuisances.without("hysteresis", "cross_talk", "gain_spread", "saturation_counts")
 
     def mixed(number: int) -> Batch:

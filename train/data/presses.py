@@ -22,13 +22,11 @@ from firmware_bridge.recording.npz_recording import read_npz
 from train.errors import DatasetError
 from train.physics.tpsf import resample, resample_touching
 
-SEED: Final = 20240228
-"""Seed of all frozen sets: the paper's day of publication. It must never change, or figures cannot be compared."""
+SEED: Final = 20240228  # of all frozen sets; it must never change, or figures cannot be compared
 SCHEMA: Final = "tactile-edge-sr presses"
-VERSION: Final = 3
-"""Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets, 3 added poses."""
+VERSION: Final = 3  # of the presses; 3 added poses
 _MOST_FACTS_BYTES: Final = 1 << 22  # largest configuration read, in bytes; real ones take a few kB
-_AXES: Final = {
+_AXES: Final = {  # type and axes of each array; a letter is the same length everywhere
     "family": ("U", "n"),
     "pad": ("int64", "n"),
     "constants": ("float32", "np"),
@@ -42,7 +40,6 @@ _AXES: Final = {
     "twist_nmm": ("float32", "n"),
     "indentation_mm": ("float32", "n"),
 }
-"""Type and axes of each array; a letter is the same length everywhere."""
 
 
 @contextmanager
@@ -146,10 +143,7 @@ class PressSet:
 
 
 def load_presses(path: Path) -> PressSet:
-    """Load a file that `PressSet.save` has written.
-
-    DatasetError if it is absent, of another or newer format, or damaged.
-    """
+    """Load a file of `PressSet.save`; DatasetError if it is absent, of another or newer format, or damaged."""
     try:
         about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
         if str(about["schema"]) != SCHEMA or int(about["version"]) > VERSION:

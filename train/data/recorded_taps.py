@@ -5,8 +5,8 @@ scans just before it, so that no drift is in it. The authors' files, .npy with a
 image of the pad's area that is bright where it touches; `LRs`, (scans, 48) zeroed), hold a pickle. The loader knows
 arrays, lists, dicts and numbers alone, and calls nothing that a pickle names.
 
-Where the plate lies and how the pad is mounted was measured by someone to some tenths of a millimetre. These six
-numbers are fitted first: at the right ones the readings of all taps look like those of the simulated pad.
+Where the plate lies and how the pad is mounted is known to some tenths of a millimetre. These six numbers are fitted
+first: at the right ones the readings of all taps look like those of the simulated pad.
 
 Source of the layout: Wu and Liu 2024, https://github.com/wmtlab/tactileSR.
 """
@@ -60,7 +60,7 @@ class RecordedTap:
 def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedTap]:
     """Return the taps of one sensor in a recording that have a pose, or those of a published file.
 
-    RecordingError, BaselineRefusedError or DatasetError if there are none, or the pad is never free.
+    RecordingError, BaselineRefusedError or DatasetError if there are none.
     """
     if path.suffix == ".npy":
         return _published_taps(path)
@@ -85,8 +85,7 @@ def recorded_presses(
 ) -> list[tuple[NDArray[np.float32], PadPose | None]]:
     """Return the rising scans (frames, 3, rows, cols) of each press on one sensor, and its pose where it has one.
 
-    The scans are over the pad that was free before. BaselineRefusedError or DatasetError if the sensor is not there or
-    another one, or the pad is never free.
+    BaselineRefusedError or DatasetError if the sensor is not there or another one, or the pad is never free.
     """
     track, counts = _zeroed(recording, entry, sensor)
     times = track.time_ns if track.time_ns is not None and not recording.poses_by_row else np.arange(len(counts))
@@ -238,8 +237,7 @@ def _published_tap(held: Mapping[str, Any]) -> RecordedTap:
     return RecordedTap(_rise(counts[int(np.argmax(z > _TOUCH * z[peak])) : peak + 1]), Pose(0.0, 0.0, 0.0), image)
 
 
-Surface = Callable[[Pose, GrippedPad], NDArray[np.float32]]
-"""Function from a pose over a surface to its heights (m, m) in [mm] at the places of a pad."""
+Surface = Callable[[Pose, GrippedPad], NDArray[np.float32]]  # from a pose to heights (m, m) in [mm]
 FIT_FROM: Final = 30  # taps by which the poses are fitted
 _STEPS: Final = np.array([0.2, 0.2, 0.5, 0.2, 0.2, 0.5])  # by which the effect of a pose is found, in [mm] and [deg]
 LEAST_LIKENESS: Final = 0.8
@@ -247,10 +245,7 @@ _FLAT_MM: Final = 0.1  # depth below the top at which a part of a flat figure ca
 
 
 def surface_of(path: Path, unit_mm: float = 1.0, pixel_mm: float = 0.1) -> Surface:
-    """Return the surface of a mesh or of a depth image, PNG, whose middle is the origin of the poses.
-
-    MeshError or DatasetError if it cannot be read.
-    """
+    """Return the surface of a mesh or depth image, PNG, whose middle is the origin; MeshError, DatasetError if none."""
     if path.suffix.lower() != ".png":
         relief = Relief(path.name, load_mesh(path, unit_mm))
         return lambda pose, pad: -depth_image(relief, pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)
@@ -341,10 +336,7 @@ def _shape(z: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def pressed(poses: Sequence[Pose], surface: Surface, pad: GrippedPad) -> Taps:
-    """Return taps of the simulated pad at these poses, to the largest indentation.
-
-    DatasetError if the surface is not under a pose, or is not a flat figure there.
-    """
+    """Return taps of the simulated pad, to the largest indentation; DatasetError if no flat figure is under a pose."""
     try:
         heights_mm = np.stack([surface(pose, pad) for pose in poses])
         depth_mm = heights_mm.max(axis=(1, 2), keepdims=True) - heights_mm

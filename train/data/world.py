@@ -20,12 +20,9 @@ from train.surfaces.meshes import MESH, mesh_file
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import MAX_TAPS, schedule_of
 
-INDENTATION_MM: Final = (0.03, 0.5)
-"""Bounds of the indentation, drawn uniformly, in [mm]; the layer is linear up to the upper one."""
-LEAST_FORCE_N: Final = 0.1
-"""Least force of a press that is kept: about twice the force at which a contact is detected above the noise."""
-MOST_DRAWS: Final = 40
-"""Most draws of a press of a user's mesh: of a sloping finger one in seven is kept, so that all are found."""
+INDENTATION_MM: Final = (0.03, 0.5)  # bounds of the uniform draw; the layer is linear up to the upper one
+LEAST_FORCE_N: Final = 0.1  # of a press that is kept: twice that at which a contact is detected above the noise
+MOST_DRAWS: Final = 40  # of a press of a user's mesh: of a sloping finger one in seven is kept, so that all are found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,7 +18,7 @@ from train.surfaces.poses import over_surface, random_poses
 
 FIGURES: Final = ("paper", "glyph", "polygon")  # families of flat figures on a plate: the paper's 18, and random ones
 
-SHARES: Final[Mapping[str, float]] = {
+SHARES: Final[Mapping[str, float]] = {  # relative frequency of each family in training
     "paper": 20,
     "glyph": 14,
     "polygon": 14,
@@ -41,12 +41,8 @@ SHARES: Final[Mapping[str, float]] = {
     "soft": 5,
     "glove": 5,
 }
-"""Relative frequency of each family in training."""
-
-_PAIRED: Final = ("block", "edge", "dome", "cylinder", "wire", "cone", "solid")
-"""Shapes of which two may be under the pad at once."""
-_LEVEL: Final = 0.3
-"""Share of shapes that lie level; the others tilt by up to three degrees, most of them by less than one."""
+_PAIRED: Final = ("block", "edge", "dome", "cylinder", "wire", "cone", "solid")  # of which two may be under the pad
+_LEVEL: Final = 0.3  # share of shapes that lie level; the others tilt by up to three degrees, most by less than one
 _REACH_MM: Final = 6.0
 _FIGURE_SLOPE: Final = float(np.tan(np.radians(0.5)))
 

@@ -1,7 +1,4 @@
-"""Shapes under the pad: faces of solid bodies, round and rough shapes, and everyday solids.
-
-Faces are larger than the pad or cross it with an edge, a corner, a slot or a step.
-"""
+"""Shapes under the pad: faces of solid bodies, round and rough shapes, and everyday solids."""
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -12,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Lengths = NDArray[np.float32]  # lengths at places on a grid, in [mm]
-Height = Callable[[Lengths, Lengths], Lengths]
-"""Height in [mm] at x and y in [mm], NOWHERE_MM off the shape; higher parts touch the pad first."""
+Height = Callable[[Lengths, Lengths], Lengths]  # height at x and y in [mm], NOWHERE_MM off the shape
+# Height at x and y of the shape that a generator draws; the draws do not depend on the places.
 Shape = Callable[[np.random.Generator, Lengths, Lengths], Lengths]
-"""Height at x and y of the shape that a generator draws; the draws do not depend on the places."""
 
 NOWHERE_MM: Final = -1e3  # height where there is no shape, out of any press's reach
 SLOPE: Final = float(np.tan(np.radians(3.0)))  # largest tilt of a face against the pad: three degrees
@@ -268,8 +264,7 @@ def _plug(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
 SOLIDS: Final[tuple[Shape, ...]] = (
     *(_coin, _washer, _nut, _screw, _button, _key, _cap, _studs, _thread, _gear, _pen, _plug),
 )
-SHAPES: Final[Mapping[str, Shape]] = {
+SHAPES: Final[Mapping[str, Shape]] = {  # families that are heights, by name
     **{shape.__name__: shape for shape in (flat, block, edge, corner, slot, step, dome, cylinder, cone, ridge)},
     **{shape.__name__: shape for shape in (wire, saddle, relief, grating, solid)},
 }
-"""Families that are heights, by name."""

@@ -14,8 +14,7 @@ from train.errors import MeshError
 MESH: Final = "mesh:"  # beginning of a surface's name that is a user's file
 _UNIT: Final = "?unit_mm="
 SUFFIXES: Final = (".stl", ".obj", ".ply")
-MAX_FILE_BYTES: Final = 100_000_000
-"""Largest file read: two million triangles of a binary STL. A longer one would fill the memory first."""
+MAX_FILE_BYTES: Final = 100_000_000  # two million triangles of a binary STL; a longer one would fill the memory
 _TO_ASCII: Final = bytes(range(128)) + b"?" * 128
 
 
@@ -43,8 +42,7 @@ def size_of(name: str) -> str:
 def load_mesh(path: Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
     """Read an STL, OBJ or PLY file as a closed surface in [mm]: z up as it stands, top at z = 0, centred on x = y = 0.
 
-    Several bodies in it are taken together.
-    MeshError if it is absent, broken, empty, open, flat, or of an impossible size.
+    Several bodies are taken together. MeshError if it is absent, broken, empty, open, flat, or of an impossible size.
     """
     if not (isfinite(unit_mm) and unit_mm > 0):
         raise MeshError(f"--unit-mm is {unit_mm:g}; it must be a length above 0, such as 1000 for a file in metres")

@@ -62,10 +62,7 @@ SURFACES: Final = LETTERS + SHAPES  # names of the 18 surfaces, nine on each pla
 
 
 def surface_mesh(name: str) -> trimesh.Trimesh:
-    """Return the mesh of a `figure` on its plate, closed bodies side by side, or a user's, centred on x = y = 0.
-
-    SurfaceError if there is none of that name.
-    """
+    """Return the mesh of a `figure` on its plate, closed bodies side by side, or a user's, centred on x = y = 0."""
     if name.startswith(MESH) and name != MESH:
         return load_mesh(*mesh_file(name))
     down = trimesh.transformations.translation_matrix([0, 0, -FIGURE_HEIGHT_MM])
@@ -83,10 +80,7 @@ def relief(name: str) -> Relief:
 
 
 def figure(name: str) -> BaseGeometry:
-    """Return the outline in [mm] of one of SURFACES, centred on the origin, or of glyph:SEED or polygon:SEED.
-
-    SurfaceError if there is none of that name.
-    """
+    """Return the outline in [mm] of one of SURFACES, of glyph:SEED or polygon:SEED; SurfaceError if there is none."""
     kind, _, seed = name.partition(":")
     if name in SURFACES:
         return _letter(name) if name in _STROKES else _shape(*name.split())

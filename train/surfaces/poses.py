@@ -18,13 +18,12 @@ from firmware_bridge.pad_geometry import USPA44
 from train.surfaces.depth_image import Pose
 
 Split = Literal["validation", "test"]
+# Place of each split's targets: the first two of the paper's positions, a grid of 3 x 3 around the centre.
 PLACES_MM: Final[Mapping[Split, tuple[float, float]]] = {"test": (-2.5, 2.5), "validation": (0.0, 2.5)}
-"""Place of each split's targets: the first two of the paper's positions, a grid of 3 x 3 around the centre."""
 ANGLE_STEP_DEG: Final = 5.0
 MAX_TAPS: Final = 7
 TARGET_ANGLES_DEG: Final = (0.0, 30.0, 60.0, 90.0)
-HELD_OUT_RADIUS_MM: Final = 1.0
-"""Distance that random poses keep from the two held-out positions, in [mm]; see docs/decisions.md."""
+HELD_OUT_RADIUS_MM: Final = 1.0  # distance that random poses keep from the two held-out positions
 SURFACE_REACH_MM: Final = 3.5  # largest distance of random poses from the surface's centre along x and along y, in [mm]
 
 HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
@@ -32,8 +31,7 @@ REACH_MM: Final = 6.0  # largest distance of an earlier tap: two thirds of both 
 NEAR_MM: Final = 3.0
 NEAR_DEG: Final = 45.0  # bounds of most random poses
 
-Schedule = Callable[[np.random.Generator, int], NDArray[np.float64]]
-"""Function from draws and a number of taps, K, to their poses (K, 3)."""
+Schedule = Callable[[np.random.Generator, int], NDArray[np.float64]]  # from a number of taps, K, to their poses (K, 3)
 
 
 def random_poses(rng: np.random.Generator, count: int) -> list[Pose]:
@@ -101,10 +99,7 @@ def mixed(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
 
 
 def schedule_of(name: str) -> Schedule:
-    """Return a schedule by its name; `turns:30` turns by 30 degrees from tap to tap.
-
-    ValueError if there is none of that name.
-    """
+    """Return a schedule by its name, or ValueError; `turns:30` turns by 30 degrees from tap to tap."""
     if name.startswith("turns:"):
         step = float(name.partition(":")[2]) / ANGLE_STEP_DEG
         if not 0 <= step * ANGLE_STEP_DEG <= 180:
@@ -125,4 +120,3 @@ def _within(rng: np.random.Generator, taps: int, reach_mm: float, turn_deg: floa
 SCHEDULES: Final[Mapping[str, Schedule]] = {
     kind.__name__.replace("_", "-"): kind for kind in (turns, half_pitch, near, far, slide, mixed)
 }
-"""Schedules by name."""
