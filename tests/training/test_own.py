@@ -19,7 +19,6 @@ from train import own
 from train.data.press_batches import OneSensor, PressBatches
 from train.data.real_grips import Grip
 from train.data.world import World, solve_pad
-from train.errors import DatasetError
 from train.own import OWN, REPLACED, TAPPED, UNLIKE, Knowledge, compared, knowledge_of, main
 from train.physics.pad_draws import KNOWN, RANGES
 from train.physics.sensor_noise import NAMES, Nuisances
@@ -51,30 +50,13 @@ def test_pads_are_drawn_as_wide_as_what_is_not_known():
     text = found.told()
     assert "thickness_mm to 11%" in text and "gains to 1.5 %" in text and "not known: poisson, " in text
 
-
-@pytest.mark.parametrize(("interval", "expected"), [((1050.0, 1200.0), (1050.0, 1200.0)), (None, None)])
-def test_a_weight_draws_pads_within_its_own_interval(interval, expected):
-    """Not within one that the pad has without a value."""
-    entry = SensorEntry(
-        pad=Pad(intervals={"counts_per_newton": (10.0, 20.0)}),
+    weighed = SensorEntry(
+        pad=Pad(intervals={"counts_per_newton": (10.0, 20.0)}),  # without a value
         counts_per_newton=1100.0,
-        counts_per_newton_interval=interval,
+        counts_per_newton_interval=(1050.0, 1200.0),
     )
-    low, high = knowledge_of(SensorFile(sensors={"4": entry}), None).ranges["counts_per_newton"]
-    assert expected in (None, (low, high)) and low < 1100 < high
-
-
-@pytest.mark.parametrize(
-    ("names", "asked", "complaint"),
-    [
-        ("46", None, "has the sensors 4, 6: name one with --sensor"),
-        ("", None, "has the sensors none"),
-        ("4", "6", "--sensor 6: the sensor file has 4"),
-    ],
-)
-def test_which_sensor_is_said_in_a_line(names, asked, complaint):
-    with pytest.raises(DatasetError, match=complaint):
-        knowledge_of(SensorFile(sensors={name: SensorEntry() for name in names}), asked)
+    ranges = knowledge_of(SensorFile(sensors={"4": weighed}), None).ranges
+    assert ranges["counts_per_newton"] == (1050, 1200), "by the interval of the weight"
 
 
 def test_its_network_is_told_of_it_in_most_windows():
@@ -122,6 +104,8 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     ("held", "options", "told"),
     [
         (None, [], "sensor.toml"),
+        (SensorFile(sensors={"4": SensorEntry(), "6": SensorEntry()}), [], "the sensors 4, 6: name one with --sensor"),
+        (FILE, ["--sensor", "6"], "--sensor 6: the sensor file has 4"),
         (SensorFile(sensors={"4": SensorEntry()}), [], "nothing is known of this sensor, "),
         (REHEARSED, [], "has force of an emulated sensor 4, .*: write one of your sensor with edge-sr doctor --out"),
         (BEYOND, [], "thickness_mm of sensor 4 is 50, expected 3.1 to 7.2 of a pad that can be simulated: measure it"),

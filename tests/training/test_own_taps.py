@@ -110,13 +110,10 @@ def test_a_bad_recording_is_one_line(tapped, tmp_path, change, lines, complaint)
         taps.main(arguments(folder, recording=tmp_path / "bad.csv"))
 
 
-def test_a_recording_of_another_sensor_is_one_line(tapped, tmp_path):
+def test_another_sensor_or_a_bad_surface_is_one_line(tapped, tmp_path):
     path = write_npz(tmp_path / "other.npz", np.full((200, 3, 4, 4), 30_000), sensors=["6"] * 200)
     with pytest.raises(SystemExit, match=r"^train\.taps: .*other.npz has the sensors 6, none of them 4$"):
         taps.main(arguments(tapped[0], recording=path))
-
-
-def test_a_bad_surface_is_one_line(tapped, tmp_path):
     plate_mesh(FIGURES).apply_scale(0.001).export(tmp_path / "metres.stl")
     (tmp_path / "broken.png").write_bytes(b"no picture")
     imsave(tmp_path / "even.png", np.zeros((2, 2)))
@@ -178,34 +175,29 @@ class Evil:
         return self._call[0], self._call[1:]
 
 
-@pytest.mark.parametrize(
-    "held",
-    [
-        [Evil(print, "run")],
-        [{"depth": Evil(eval, "1 + 1"), "LRs": []}],
-        [{"depth": np.ones((2, 2)), "LRs": Evil(np.fromfile, "/etc/hostname")}],
-        [{"depth": np.eye(2), "LRs": [[np.nan] * 48]}],
-        [{"depth": np.eye(2), "LRs": [[1.0] * 47]}],
-        [3],
-        [Evil(bytearray, 1 << 40)],
-    ],
-)
-def test_a_hostile_or_wrong_file_is_one_line_and_runs_nothing(tapped, tmp_path, capsys, held):
-    path, sensor_file = published(tmp_path / "C.npy", held), tapped[0] / "sensor.toml"
-    with pytest.raises(SystemExit, match=r"^train\.taps: .* is not a file of published taps"):
-        taps.main([str(path), "--sensor-file", str(sensor_file), "--out", str(tmp_path / "t.npz")])
-    assert capsys.readouterr() == ("", "")
-
-
-def test_broken_bytes_are_one_line(tapped, tmp_path, capsys):
-    whole = published(tmp_path / "C.npy", [{"depth": np.eye(4), "LRs": [[1.0] * 48]}]).read_bytes()
+def test_a_hostile_or_broken_file_is_one_line_and_runs_nothing(tapped, tmp_path, capsys):
+    sensor_file = tapped[0] / "sensor.toml"
+    for held in (
+        Evil(print, "run"),
+        {"depth": Evil(eval, "1 + 1"), "LRs": []},
+        {"depth": np.ones((2, 2)), "LRs": Evil(np.fromfile, "/etc/hostname")},
+        {"depth": np.eye(2), "LRs": [[np.nan] * 48]},
+        {"depth": np.eye(2), "LRs": [[1.0] * 47]},
+        3,
+        Evil(bytearray, 1 << 40),
+    ):
+        path = published(tmp_path / "C.npy", [held])
+        with pytest.raises(SystemExit, match=r"^train\.taps: .* is not a file of published taps"):
+            taps.main([str(path), "--sensor-file", str(sensor_file), "--out", str(tmp_path / "t.npz")])
+        assert capsys.readouterr() == ("", "")
+    whole = published(path, [{"depth": np.eye(4), "LRs": [[1.0] * 48]}]).read_bytes()
     rng = np.random.default_rng(0)
     damaged = [whole[:end] for end in range(0, len(whole), 37)]
     for _ in range(200):
         at, spoilt = int(rng.integers(len(whole))), bytearray(whole)
         spoilt[at] = int(rng.integers(256))
         damaged.append(bytes(spoilt))
-    entry = load_sensor_file(tapped[0] / "sensor.toml").sensors["4"]
+    entry = load_sensor_file(sensor_file).sensors["4"]
     for content in damaged:
         (tmp_path / "broken.npy").write_bytes(content)
         try:
