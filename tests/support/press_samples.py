@@ -13,17 +13,16 @@ def make_press_set(count=12, taps=2, seed=0) -> PressSet:
     across = (np.arange(40) - 19.5) / 10
     dome = np.exp(-(across[:, None] ** 2 + across**2))
     traction = rng.standard_normal((count, 3, 8, 8))
+    constants = rng.uniform(-1, 1, (count, len(INPUTS))).astype(np.float32)
+    counts = 2000 * rng.uniform(-1, 1, (count, taps, 3, 4, 4)) * depth_mm[:, None, None, None, None]
+    turn_deg = np.tile(5.0 * np.arange(taps, dtype=np.float32), (count, 1))
     return PressSet(
         family=np.array(["flat", "dome", "glyph"])[np.arange(count) % 3],
         pad=np.arange(count) // 4,
-        constants=rng.uniform(-1, 1, (count, len(INPUTS))).astype(np.float32),
-        counts=(2000 * rng.uniform(-1, 1, (count, taps, 3, 4, 4)) * depth_mm[:, None, None, None, None]).astype(
-            np.float32
-        ),
-        angle_deg=np.tile(-5.0 * np.arange(taps), (count, 1)).astype(np.float32),
-        poses=np.stack([np.zeros((count, taps))] * 2 + [np.tile(5.0 * np.arange(taps), (count, 1))], axis=2).astype(
-            np.float32
-        ),
+        constants=constants,
+        counts=counts.astype(np.float32),
+        angle_deg=-turn_deg,
+        poses=np.stack([0 * turn_deg, 0 * turn_deg, turn_deg], axis=2),
         patterns=(dome * depth_mm[:, None, None]).astype(np.float16),
         touching=np.broadcast_to(dome > 0.5, (count, 40, 40)).copy(),
         traction_kpa=(50 * traction * depth_mm[:, None, None, None]).astype(np.float16),

@@ -60,6 +60,8 @@ def test_the_demo_is_made_as_the_bundled_one(tmp_path):
 
 @pytest.mark.night
 def test_the_command_keeps_a_frozen_set_that_is_there(tmp_path):
+    with pytest.raises(SystemExit, match=r"^freeze: .*no such file"):
+        main([str(tmp_path), "--data", str(tmp_path / "absent.npz")])
     shutil.copy(BUNDLE_DIR / "frozen.npz", tmp_path)
     make_press_set(600).save(tmp_path / "seen.npz")
     before = (tmp_path / "frozen.npz").stat()
@@ -67,11 +69,6 @@ def test_the_command_keeps_a_frozen_set_that_is_there(tmp_path):
     names = [f"{name}.npz" for name in ("classical", "demo", "frozen", "grip", "seen", "taxels")]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     assert (tmp_path / "frozen.npz").stat() == before
-
-
-def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
-    with pytest.raises(SystemExit, match=r"^freeze: .*no such file"):
-        main([str(tmp_path), "--data", str(tmp_path / "absent.npz")])
 
 
 def test_kinds_of_contact_are_separated_at_any_scale():

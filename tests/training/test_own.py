@@ -15,7 +15,6 @@ from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
-from train import own
 from train.data.press_batches import OneSensor, PressBatches
 from train.data.real_grips import Grip
 from train.data.world import World, solve_pad
@@ -133,20 +132,3 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, held, options, told):
         save_sensor_file(tmp_path / "sensor.toml", held)
     with pytest.raises(SystemExit, match=rf"^train\.own: [^\n]*{told}[^\n]*$"):
         main(["sensor.toml", "--out", "mine", *options])
-
-
-@pytest.mark.night
-def test_from_a_sensor_file_to_a_model(tmp_path, capsys, limits):
-    """In miniature it learns nothing, so it is not handed over; continued, it is judged again."""
-    limits(own, TRIED=48, COMPARED=24)
-    save_sensor_file(tmp_path / "s.toml", FILE)
-    for _ in range(2):
-        with pytest.raises(SystemExit, match=r"^1$"):
-            main(
-                [str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--minutes", "0.01", "--without-recordings"]
-            )
-        assert "not handed over: " in capsys.readouterr().out
-    assert not (tmp_path / "mine/mine.onnx").exists()
-    contract = ModelSession(tmp_path / "mine/work/mine-int8.onnx").contract
-    assert contract.made_for["thickness_mm"] == [4.9, 5.1] and contract.read_trust() is not None
-    assert contract.is_outside(None) and not contract.is_outside(THICK.behind(Pad(counts_per_newton=1100)))

@@ -9,18 +9,9 @@ from train.families.family_shares import SHARES, draw_shape
 from train.families.shapes import NOWHERE_MM
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import NOMINAL
+from train.surfaces import named_surfaces
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, depth_image
-from train.surfaces.named_surfaces import (
-    AREA_MM2,
-    FIGURE_HEIGHT_MM,
-    GLYPH_REACH_MM,
-    PLATE_MM,
-    POLYGON_REACH_MM,
-    SURFACES,
-    figure,
-    relief,
-    surface_mesh,
-)
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, PLATE_MM, SURFACES, figure, relief, surface_mesh
 from train.surfaces.poses import (
     HELD_OUT_RADIUS_MM,
     MAX_TAPS,
@@ -50,17 +41,19 @@ def test_every_surface_is_closed_and_shown_with_its_area(name):
     assert set(np.unique(seen.round(5))) <= {0.0, FIGURE_HEIGHT_MM, NOTHING_MM}
 
 
-@pytest.mark.parametrize("name", ["Q", "", "s", "glyph", "glyph:-1", "glyph:1.5", "polygon:²", "mesh:", "cone:3"])
-def test_an_unknown_name_lists_the_kinds(name):
-    with pytest.raises(SurfaceError, match=r"small triangle.*glyph:SEED.*mesh:PATH"):
-        surface_mesh(name)
+def test_an_unknown_name_lists_the_kinds():
+    for name in ("Q", "", "s", "glyph", "glyph:-1", "glyph:1.5", "polygon:²", "mesh:", "cone:3"):
+        with pytest.raises(SurfaceError, match=r"small triangle.*glyph:SEED.*mesh:PATH"):
+            surface_mesh(name)
 
 
-@pytest.mark.parametrize(("kind", "reach_mm"), [("glyph", GLYPH_REACH_MM), ("polygon", POLYGON_REACH_MM)])
-def test_random_figures_are_valid_and_coarse_enough_to_feel(kind, reach_mm):
+@pytest.mark.parametrize("kind", ["glyph", "polygon"])
+def test_random_figures_are_valid_and_coarse_enough_to_feel(kind):
+    least_mm2, most_mm2 = named_surfaces.AREA_MM2
+    reach_mm = named_surfaces.GLYPH_REACH_MM if kind == "glyph" else named_surfaces.POLYGON_REACH_MM
     drawn = [figure(f"{kind}:{seed}") for seed in range(100)]
     for seed, outline in enumerate(drawn):
-        assert outline.is_valid and AREA_MM2[0] - 0.1 < outline.area < AREA_MM2[1] + 0.1, seed
+        assert outline.is_valid and least_mm2 - 0.1 < outline.area < most_mm2 + 0.1, seed
         assert np.abs(outline.bounds).max() <= reach_mm + 1e-9, seed
         eroded = outline.buffer(-0.2, join_style="mitre").buffer(0.2, join_style="mitre")
         filled = outline.buffer(0.2, join_style="mitre").buffer(-0.2, join_style="mitre")
@@ -82,14 +75,11 @@ def test_a_slope_is_exact_at_every_pixel(angle_deg):
     assert 0 <= depth.min() <= 0.13 * np.sqrt(2) * CELL_MM / 2
 
 
-def test_what_is_finer_than_a_cell_is_not_felt():
-    slab, needle = trimesh.creation.box([20, 20, 1]), trimesh.creation.box([0.2, 0.2, 3])
-    assert np.allclose(depth_image(Relief("needle", slab + needle), CENTRE, SIZE, CELL_MM), 0, atol=1e-6)
-
-
-def test_a_letter_stands_upright_as_seen_through_the_pad():
+def test_a_letter_stands_upright_and_what_is_finer_than_a_cell_is_not_felt():
     letter = depth_image(relief("F"), CENTRE, 41, 0.5) < FIGURE_HEIGHT_MM / 2
     assert letter[:20].sum() > letter[21:].sum() and letter[:, :20].sum() > letter[:, 21:].sum()
+    slab, needle = trimesh.creation.box([20, 20, 1]), trimesh.creation.box([0.2, 0.2, 3])
+    assert np.allclose(depth_image(Relief("needle", slab + needle), CENTRE, SIZE, CELL_MM), 0, atol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -131,16 +121,13 @@ def test_a_tap_that_would_miss_the_shape_lands_nearer(pad):
     assert tapped.heights_mm[1].max() > NOWHERE_MM / 2
 
 
-@pytest.mark.parametrize("name", SCHEDULES)
-def test_every_schedule_stays_within_reach(name):
-    for seed in range(30):
-        poses = SCHEDULES[name](np.random.default_rng(seed), MAX_TAPS)
-        assert poses.shape == (MAX_TAPS, 3) and not poses[0].any()
-        assert np.hypot(*poses[:, :2].T).max() <= REACH_MM + 1e-9
-        assert SCHEDULES[name](np.random.default_rng(seed), 1).shape == (1, 3)
-
-
-def test_random_poses_keep_away_from_held_out_positions():
+def test_poses_stay_within_reach_and_away_from_held_out_places():
+    for name, schedule in SCHEDULES.items():
+        for seed in range(30):
+            poses = schedule(np.random.default_rng(seed), MAX_TAPS)
+            assert poses.shape == (MAX_TAPS, 3) and not poses[0].any(), name
+            assert np.hypot(*poses[:, :2].T).max() <= REACH_MM + 1e-9, name
+            assert schedule(np.random.default_rng(seed), 1).shape == (1, 3), name
     drawn = np.array(random_poses(np.random.default_rng(1), 3000))
     for place_mm in PLACES_MM.values():
         distance_mm = np.hypot(*(drawn[:, :2] - place_mm).T)
