@@ -44,7 +44,6 @@ FIGURE_MM: Final = 50.0  # longest side of the long letter
 HALF_LENGTH_MM: Final = 30.0
 _RASTER_MM: Final = 0.05
 _INDENTATION_MM: Final = (0.15, 0.4)
-_AT_ONCE: Final = 50
 _HEAD: Final = {"format": np.array(NPZ_FORMAT), "version": np.array(NPZ_VERSION), "rate_hz": np.array(RATE_HZ)}
 # The zero is a second old: no drift yet, and the pad has not moved in the earth's field.
 _SENSOR: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
@@ -138,7 +137,7 @@ def _slide(pad: GrippedPad) -> tuple[NDArray[np.float32], NDArray[np.float64], N
     lying = affinity.rotate(figure("S"), 90, origin=(0, 0))
     left, low, right, high = lying.bounds
     flat = LETTER_WIDTH_MM / FIGURE_MM * (right - left) / (high - low)
-    outline = affinity.scale(affinity.scale(lying, 1, flat, origin=(0, 0)), 1, -1, origin=(0, 0))
+    outline = affinity.scale(lying, 1, -flat, origin=(0, 0))
     left, low, right, high = outline.bounds
     x_mm, y_mm, factor = (left + right) / 2, (low + high) / 2, FIGURE_MM / max(right - left, high - low)
     outline = affinity.translate(affinity.scale(outline, factor, factor, origin=(x_mm, y_mm)), -x_mm, -y_mm)
@@ -146,49 +145,39 @@ def _slide(pad: GrippedPad) -> tuple[NDArray[np.float32], NDArray[np.float64], N
     rng = np.random.default_rng([500, 18])
     length = round(2 * HALF_LENGTH_MM / 20.0 * RATE_HZ)  # 20 mm/s
     friction, turn_deg = rng.uniform(0.2, 0.8), float(rng.uniform(-10, 10))
-    place = np.stack([np.linspace(-HALF_LENGTH_MM, HALF_LENGTH_MM, length)] + [np.zeros(length)] * 2, axis=1)
-    place[:, 2] = turn_deg
+    along_mm = np.linspace(-HALF_LENGTH_MM, HALF_LENGTH_MM, length)
     wave = np.sin(2 * np.pi * (np.arange(length) / length * rng.uniform(1, 3) + rng.random()))
     deep_mm = np.mean(_INDENTATION_MM) + wave * np.ptp(_INDENTATION_MM) / 2
-    clean = _pressed(pad, outline, place, deep_mm, friction)
+    heights_mm = _heights_under(pad, outline, along_mm, turn_deg)
+    meets = np.flatnonzero((heights_mm > -FIGURE_HEIGHT_MM / 2).any(axis=(1, 2)))
+    none, turn = np.zeros(len(meets)), np.radians(turn_deg)
+    # Movement in [mm] against the pad's face that friction carries, in the pad's axes: to the left.
+    drag = -0.3 * np.stack([none + np.cos(turn), none - np.sin(turn)], axis=1)
+    clean = np.zeros((length, *USPA44.scan_shape), dtype=np.float32)
+    bare = [BARE] * len(meets)
+    clean[meets] = pad.press(heights_mm[meets], deep_mm[meets], drag, none, none + friction, bare).counts
     off_mm, off_deg = rng.normal(0, PLACE_ERROR_MM, 2), rng.normal(0, TURN_ERROR_DEG)
+    stated = np.stack([along_mm + off_mm[0], np.full(length, off_mm[1]), np.full(length, turn_deg + off_deg)], axis=1)
     read = apply_nuisances(clean[None, None], _SENSOR, SEED, tap_s=length / RATE_HZ, angle_deg=-turn_deg)[0, 0]
 
     count = round((FIGURE_MM + USPA44.width_mm) * LETTER_PX_PER_MM)
     middle = (np.arange(count) - (count - 1) / 2) / LETTER_PX_PER_MM
-    return read, place + np.array([*off_mm, off_deg]), shapely.contains_xy(outline, *np.meshgrid(middle, middle))
+    return read, stated, shapely.contains_xy(outline, *np.meshgrid(middle, middle))
 
 
-def _pressed(
-    pad: GrippedPad, outline: BaseGeometry, place: NDArray[np.float64], deep_mm: NDArray[np.float64], friction: float
+def _heights_under(
+    pad: GrippedPad, outline: BaseGeometry, along_mm: NDArray[np.float64], turn_deg: float
 ) -> NDArray[np.float32]:
-    """Return the counts (n, 3, rows, cols) of a pad at places (n, 3) over a raised figure, dragged to the left."""
+    """Return the heights (n, m, m) in [mm] of a raised figure under a turned pad at each place along it."""
     half = HALF_LENGTH_MM + USPA44.width_mm
     centres = np.arange(-half, half, _RASTER_MM) + _RASTER_MM / 2
     shapely.prepare(outline)
-    inside = np.stack([shapely.contains_xy(outline, centres, np.full(len(centres), y)) for y in centres])
-    heights_mm = np.where(inside, 0, -FIGURE_HEIGHT_MM).astype(np.float32)
+    inside = shapely.contains_xy(outline, *np.meshgrid(centres, centres))
     x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
-
-    def under(x: float, y: float, turn_deg: float) -> NDArray[np.float32]:
-        turn = np.radians(turn_deg)
-        right = x + np.cos(turn) * x_mm - np.sin(turn) * y_mm
-        down = y + np.sin(turn) * x_mm + np.cos(turn) * y_mm
-        col, row = (np.clip(((at + half) / _RASTER_MM).astype(int), 0, len(centres) - 1) for at in (right, down))
-        return heights_mm[row, col]
-
-    counts = np.zeros((len(place), *USPA44.scan_shape), dtype=np.float32)
-    for start in range(0, len(place), _AT_ONCE):
-        heights = np.stack([under(*pose) for pose in place[start : start + _AT_ONCE]])
-        meets = np.flatnonzero((heights > -FIGURE_HEIGHT_MM / 2).any(axis=(1, 2)))
-        if len(meets):
-            turn = np.radians(place[start + meets, 2])
-            # Movement in [mm] against the pad's face that friction carries, in the pad's axes.
-            drag = -0.3 * np.stack([np.cos(turn), -np.sin(turn)], axis=1)
-            still, even, bare = np.zeros(len(meets)), np.full(len(meets), friction), [BARE] * len(meets)
-            pressed = pad.press(heights[meets], deep_mm[start + meets], drag, still, even, bare)
-            counts[start + meets] = pressed.counts
-    return counts
+    cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    right, down = along_mm[:, None, None] + cosine * x_mm - sine * y_mm, sine * x_mm + cosine * y_mm
+    col, row = (np.clip(((at + half) / _RASTER_MM).astype(int), 0, len(centres) - 1) for at in (right, down))
+    return np.where(inside[row, col], 0, -FIGURE_HEIGHT_MM).astype(np.float32)
 
 
 def _course() -> NDArray[np.float64]:
