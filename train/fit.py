@@ -104,12 +104,8 @@ def _parser() -> argparse.ArgumentParser:
     add("folder", type=Path, help="folder for the checkpoints")
     add("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
     add("--validation", type=Path, required=True, help="presses to calibrate on, not used for training")
-    alone(
-        "--network",
-        choices=NETWORKS,
-        metavar="NAME",
-        help=", ".join(NETWORKS) + "; those of the paper are seed-NAME.pt",
-    )
+    those = ", ".join(NETWORKS) + "; those of the paper are seed-NAME.pt"
+    alone("--network", choices=NETWORKS, metavar="NAME", help=those)
     alone("--start-from", metavar="NAME", help="checkpoint in the same folder, or bundled NAME.onnx, to start from")
     alone("--steps", type=int, default=9000)
     alone("--seed", type=int, default=1)

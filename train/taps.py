@@ -57,11 +57,8 @@ def tapped(paths: Sequence[Path], surfaces: Sequence[Surface], knowledge: Knowle
     for number, path in enumerate(paths):
         taps = recorded_taps(path, entry, knowledge.name)
         if taps[0].image is not None:
-            under = [
-                (image_surface(tap.image, _IMAGE_MM / len(tap.image)), tap.pose)
-                for tap in taps
-                if tap.image is not None
-            ]
+            images = [(tap.image, tap.pose) for tap in taps if tap.image is not None]
+            under = [(image_surface(image, _IMAGE_MM / len(image)), pose) for image, pose in images]
             places += [(number, tap) for tap in range(len(taps))]
             say(f"{path}: {len(taps)} published taps")
         else:
@@ -158,26 +155,12 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m train.taps", description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
     add("recordings", type=Path, nargs="+", metavar="RECORDING", help="taps with poses, or .npy as the authors publish")
-    add(
-        "--surface",
-        type=Path,
-        nargs="+",
-        default=[],
-        metavar="FILE",
-        help="mesh or depth image, .png; of all or of each",
-    )
+    add("--surface", type=Path, nargs="+", default=[], metavar="FILE", help="mesh or depth image (PNG), of all or each")
     add("--sensor-file", type=Path, required=True, metavar="SENSOR.toml", help="as edge-sr doctor --out writes it")
     add("--sensor", metavar="NAME", help="which sensor of the file (default: its only one)")
     add("--out", type=Path, required=True, help="npz file of the taps")
     add("--truth", choices=TRUTHS, default=TRUTHS[0], help="how patterns are made (tpsf)")
-    add(
-        "--scale",
-        type=int,
-        choices=range(4, FINE_SCALE + 1),
-        default=SCALE,
-        metavar="4..20",
-        help="pixels a pitch (10)",
-    )
+    add("--scale", type=int, choices=range(4, FINE_SCALE + 1), default=SCALE, metavar="4..20", help="pixels a pitch")
     add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm (1)")
     add("--pixel-mm", type=positive, default=0.1, help="side of a depth image's pixel in mm (0.1)")
     return parser

@@ -123,21 +123,19 @@ def _world(options: argparse.Namespace) -> World:
         names = [name for name in options.families.split(",") if name != "none"]
         families = {name: SHARES.get(name, 1.0) for name in names}
     families |= {mesh_name(path, options.unit_mm): options.mesh_share for path in options.mesh}
-    same = ("count", "taps", "schedule", "begun", "per_pad", "spread", "seed", "pad")
+    same = ("count", "taps", "schedule", "per_pad", "spread", "seed", "pad")
     return World(families=families, **{name: getattr(options, name) for name in same})
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m train.data.make_presses", description=(__doc__ or "").splitlines()[0]
-    )
+    about = (__doc__ or "").splitlines()[0]
+    parser = argparse.ArgumentParser(prog="python -m train.data.make_presses", description=about)
     add = parser.add_argument
     add("out", type=Path, metavar="OUT.npz")
     add("--count", type=int, default=24_000, help="number of sequences (24000)")
     add("--taps", type=int, default=1, help="presses in each sequence (1)")
     schedules = f"poses of a sequence's presses: {', '.join(SCHEDULES)}, or turns:DEGREES (mixed)"
     add("--schedule", default="mixed", help=schedules)
-    add("--begun", type=float, default=0.5, help="share of sequences whose newest press has only begun (0.5)")
     add("--per-pad", type=int, default=24, help="sequences of each pad (24)")
     families = f"names with commas: {', '.join(SHARES)}, or of figures of the paper (all)"
     add("--families", default="all", help=f"all; even (equally many of each); none; or {families}")

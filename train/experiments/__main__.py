@@ -27,8 +27,8 @@ from train.report import Report
 EXPERIMENTS: Final[dict[str, Experiment]] = {
     work.__name__.replace("_", "-"): work
     for work in (
-        *(families, pads, trust_checks, posed_taps, nonnegative, real, second_world, blind_sensors, table3, table4),
-        *(angle, taps, unseen, fig7),
+        *(families, pads, trust_checks, posed_taps, nonnegative, real, second_world, blind_sensors),
+        *(table3, table4, angle, taps, unseen, fig7),
     )
 }  # functions by name; the first line of each one's docstring is its help
 
@@ -51,13 +51,10 @@ def main(arguments: list[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="\n".join(f"  {name:13} {line}" for name, line in lines.items()),
     )
-    parser.add_argument(
-        "names", nargs="+", choices=[*EXPERIMENTS, "all"], metavar="NAME", help="experiments, run in this order"
-    )
-    parser.add_argument("--reports", type=Path, default=Path("reports"), help="where to write (default: reports)")
-    parser.add_argument(
-        "--models", type=Path, default=BUNDLE_DIR, help="folder of the shipped models (default: the bundled ones)"
-    )
+    add = parser.add_argument
+    add("names", nargs="+", choices=[*EXPERIMENTS, "all"], metavar="NAME", help="experiments, run in this order")
+    add("--reports", type=Path, default=Path("reports"), help="where to write (default: reports)")
+    add("--models", type=Path, default=BUNDLE_DIR, help="folder of the models (default: the bundled ones)")
     options = parser.parse_args(arguments)
     bench = Workbench(models=options.models)
     with ended_by_errors("experiments"):

@@ -107,7 +107,7 @@ def judged(
     """
     row, found_db = dict(head), np.empty(0)
     for split, frozen in sets.items():
-        figures = judge(method.patterns(frozen.windows(method.taps, given)), frozen, method.contact_level)
+        figures = judge(method.run(frozen.windows(method.taps, given)), frozen, method.contact_level)
         row[f"{split} PSNR dB"] = with_interval(figures["psnr_db"], frozen.tap)
         row[f"{split} SSIM"] = round(float(figures["ssim"].mean()), 4)
         found_db = figures["psnr_db"]

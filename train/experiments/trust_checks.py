@@ -49,38 +49,32 @@ def trust_checks(bench: Workbench, report: Report) -> None:
     sensors = of_one_sensor_each(wide.pick(wide.presses.pad % 3 == 0))
     fresh = freeze_presses(bench.presses("judged", JUDGED), SEED)
     verdicts = judged(model, fresh, known_pads(fresh, False))
-    report.say(_METHOD)
+    report.say(
+        "Shipped models through `edge.perception.runtime`, scan by scan, with its options; nothing is known of a "
+        "sensor unless a row states it. How far a pattern is off is its RMS error over the RMS of the truth. Contacts "
+        "less than 30 % off that are not believed are false alarms, wanted at most 2 %; of those more than 50 % off 30 "
+        "% are wanted not believed, of those more than 100 % off 80 %."
+    )
     family = fresh.presses.family[verdicts.index]
     which = {name: (family == name) & ~verdicts.light for name in SHARES}
     which |= {"all": ~verdicts.light, "light": verdicts.light}
-    report.table([{"contacts of": name} | verdicts.cells(here) for name, here in which.items()], _FAMILIES)
+    rows: list[Row] = [{"contacts of": name} | verdicts.cells(here) for name, here in which.items()]
+    report.table(
+        rows,
+        "Fresh contacts by family, every press of a sensor of its own. `light`: a summed z of 750 to 1500 counts, in "
+        "which a contact can end, but not begin; the other rows leave them out.",
+    )
     half = fresh.pick(np.arange(0, len(fresh), 2))
     report.table(_by_model(models, half), "Half of these contacts by model, one tap each, of all families.")
     if recording_paths(recordings_folder()):
-        report.table(_grips(models), _GRIPS)
-    report.table(_detected(model, sensors), _DETECTED)
-
-
-_METHOD: Final = (
-    "Shipped models through `edge.perception.runtime`, scan by scan, with its options as shipped; nothing is known of "
-    "a sensor unless a row states it. How far a pattern is off is its RMS error over the RMS of the truth. Contacts "
-    "less than 30 % off that are not believed are false alarms, wanted at most 2 %; wanted of those more than 50 % off "
-    "are 30 % not believed, of those more than 100 % off 80 %. Nothing was chosen by the contacts of these tables."
-)
-_FAMILIES: Final = (
-    "Fresh contacts by family, every press of a sensor of its own. `light`: a summed z of 750 to 1500 counts, in "
-    "which a contact can end, but not begin; the other rows leave them out."
-)
-_GRIPS: Final = (
-    "Scans under load of real grips by trial, both fingers, with the rest level of the trial that ends free: not "
-    "believed, in %, wanted at most 3."
-)
-_DETECTED: Final = (
-    "Faults of a sensor, the same in all of its contacts, eleven a sensor, of the wide test set. Fields have 150 to"
-    " 1500 counts on the reading where they are largest, and come after zeroing. `another pad's file`: constants "
-    "and gains of another sensor, stated as certain. `sensor, after 10`: sensors that ten contacts have "
-    "made suspected. 95 % intervals are by sensor; where all are alike, Clopper and Pearson's."
-)
+        report.table(_grips(models), "Scans of real grips under load, both fingers: not believed, wanted at most 3 %.")
+    report.table(
+        _detected(model, sensors),
+        "Faults of a sensor, the same in all of its eleven contacts, of the wide test set. Fields have 150 to 1500 "
+        "counts on the reading where they are largest, and come after zeroing. `another pad's file`: constants and "
+        "gains of another sensor, stated as certain. `sensor, after 10`: sensors that ten contacts have made "
+        "suspected. 95 % intervals are by sensor; where all are alike, Clopper and Pearson's.",
+    )
 
 
 def _by_model(models: Sequence[ModelSession], presses: FrozenPresses) -> list[Row]:

@@ -44,10 +44,6 @@ class Method:
     run: Callable[[NDArray[np.float32]], NDArray[np.floating]]
     cost: Row = field(default_factory=dict)  # parameters and run time, as cells of a row
 
-    def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
-        """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
-        return self.run(windows[:, : self.taps])
-
 
 @dataclass
 class Workbench:
@@ -169,5 +165,4 @@ def name_of(model: ModelSession) -> str:
     return f"`{model.name}` (training {model.contract.training_sha256[:12]})"
 
 
-Experiment = Callable[[Workbench, Report], None]
-"""Function that measures with a workbench, and adds to a report what it says and its tables."""
+Experiment = Callable[[Workbench, Report], None]  # measures with a workbench, and adds to a report what it says
