@@ -47,26 +47,24 @@ def make_presses(world: World, path: Path) -> PressSet:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DatasetError(f"{folder} cannot be made: {error.strerror}") from error
-    missing = [number for number in range(world.chunks) if not _part(folder, number).exists()]
-    if any(load_presses(_part(folder, number)).config != facts for number in {*range(world.chunks)} - {*missing}):
+    paths = [folder / f"{number:06d}.npz" for number in range(world.chunks)]
+    parts = {number: load_presses(path) for number, path in enumerate(paths) if path.exists()}
+    if any(part.config != facts for part in parts.values()):
         raise DatasetError(f"{folder} holds parts that were made with other settings: delete it")
+    missing = [number for number in range(world.chunks) if number not in parts]
     with progress("pads", world.chunks, "pad", done=world.chunks - len(missing)) as bar:
         solve = partial(solve_pad, world)
         solved = map(solve, missing) if len(missing) < 2 else _workers().map(solve, missing)
         for number, part in zip(missing, solved, strict=True):
-            replace(part, config=facts).save(_part(folder, number))
+            parts[number] = replace(part, config=facts)
+            parts[number].save(paths[number])
             bar.update()
-    parts = [load_presses(_part(folder, number)) for number in range(world.chunks)]
-    if not any(len(part) for part in parts):
+    if not any(map(len, parts.values())):
         raise DatasetError(f"every press of {path} came out lighter than {LEAST_FORCE_N} N: ask for more of them")
-    made = replace(join_presses(parts), config=facts)
+    made = replace(join_presses([parts[number] for number in range(world.chunks)]), config=facts)
     made.save(path)
     shutil.rmtree(folder)
     return made
-
-
-def _part(folder: Path, number: int) -> Path:
-    return folder / f"{number:06d}.npz"
 
 
 @cache
