@@ -105,7 +105,7 @@ def test_a_cut_or_changed_file_is_refused_or_whole(tmp_path, name):
     whole, rng = FILES[name].rstrip(), np.random.default_rng(7)
     for length in range(0, len(whole) - 8, max(len(whole) // 60, 1)):
         path = saved(tmp_path, f"cut{name[-4:]}", whole[:length])
-        refused(path, "no triangles|cut short or broken|is open|corners outside|flat|at least")
+        refused(path, "no triangles|cut short or broken|is open|corners outside|flat|expected 1 to")
     for _ in range(60):
         content = np.frombuffer(FILES[name], dtype=np.uint8).copy()
         content[rng.integers(len(content), size=rng.integers(1, 8))] = rng.integers(256, dtype=np.uint8)
@@ -139,13 +139,11 @@ def test_a_mesh_that_is_no_closed_body_is_refused(tmp_path):
 def test_an_impossible_size_says_the_size_and_the_unit(tmp_path):
     for extent_mm in (1.001, 499.9):
         load_mesh(saved(tmp_path, "fits.stl", binary_stl(box((extent_mm, extent_mm / 2, extent_mm / 3)).triangles)))
-    refused(
-        saved(tmp_path, "big.stl", binary_stl(box((501, 8, 3)).triangles)),
-        "501 x 8 x 3 mm, at most 500 mm; .*pass --unit-mm if it is not",
-    )
+    big = saved(tmp_path, "big.stl", binary_stl(box((501, 8, 3)).triangles))
+    refused(big, "501 x 8 x 3 mm, expected 1 to 500 mm; .*pass --unit-mm 1000 if it is in metres")
     metres = saved(tmp_path, "metres.stl", binary_stl(box((0.02, 0.02, 0.002), at=(0, 0, 0)).triangles))
-    refused(metres, "0.02 x 0.02 x 0.002 mm, at least 1 mm; .*pass --unit-mm 1000 if it is in metres")
-    refused(saved(tmp_path, "unit.stl", binary_stl(box().triangles)), "by --unit-mm 1000, at most 500 mm", unit_mm=1000)
+    refused(metres, "0.02 x 0.02 x 0.002 mm, expected 1 to 500 mm; .*if it is in metres")
+    refused(saved(tmp_path, "unit.stl", binary_stl(box().triangles)), "by --unit-mm 1000, expected 1 to", unit_mm=1000)
     path = saved(tmp_path, "huge.stl", b"")
     with path.open("r+b") as file:
         file.truncate(MAX_FILE_BYTES + 1)

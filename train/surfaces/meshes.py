@@ -120,15 +120,10 @@ def _check_size(path: Path, corners: NDArray[np.float64], unit_mm: float) -> Non
     extent_mm = np.ptp(corners, axis=0)
     sides = _sides(extent_mm)
     size = f"{path}: {sides}" + ("" if unit_mm == 1.0 else f" by --unit-mm {unit_mm:g}")
-    if extent_mm.max() > 500:
+    if not 1 <= extent_mm.max() <= 500:
         raise MeshError(
-            f"{size}, at most 500 mm; "
-            "a file is taken to be in mm: pass --unit-mm if it is not (0.001 for micrometres), else cut out a part"
-        )
-    if extent_mm.max() < 1:
-        raise MeshError(
-            f"{size}, at least 1 mm; "
-            "a file is taken to be in mm: pass --unit-mm 1000 if it is in metres, 25.4 if in inches"
+            f"{size}, expected 1 to 500 mm; a file is taken to be in mm: pass --unit-mm 1000 if it is in metres, "
+            "25.4 if in inches, else cut out a part"
         )
     spreads = np.linalg.eigvalsh(np.cov(corners, rowvar=False))
     # A sheet is thinner than a hundred times the rounding of single precision.
