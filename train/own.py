@@ -105,12 +105,9 @@ def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
     """
     if file.geometry != USPA44:
         raise DatasetError(f"the sensor file is of a {file.geometry.name}, expected a {USPA44.name}")
-    names = ", ".join(file.sensors) or "none"
-    if name is None and len(file.sensors) != 1:
-        raise DatasetError(f"the sensor file has the sensors {names}: name one with --sensor")
-    name = name or next(iter(file.sensors))
-    if name not in file.sensors:
-        raise DatasetError(f"--sensor {name}: the sensor file has {names}")
+    name = next(iter(file.sensors)) if name is None and len(file.sensors) == 1 else name
+    if name is None or name not in file.sensors:
+        raise DatasetError(f"the sensor file has the sensors {', '.join(file.sensors)}: name one of them with --sensor")
     entry = file.sensors[name]
     if entry.emulated:
         raise DatasetError(

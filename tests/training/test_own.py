@@ -31,6 +31,7 @@ THICK = Pad(
 )
 FILE = SensorFile(sensors={"4": SensorEntry(pad=THICK, counts_per_newton=1100.0)})
 BEYOND = SensorFile(sensors={"4": SensorEntry(pad=Pad(thickness_mm=50.0))})
+OTHER_PAD = SensorFile("uSPa46", sensors={"4": SensorEntry(Mounting(taxel_count=24))})
 REHEARSED = SensorFile(sensors={"4": SensorEntry(counts_per_newton=1100.0, emulated=frozenset({"force"}))})
 
 
@@ -103,16 +104,16 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     ("held", "options", "told"),
     [
         (None, [], "sensor.toml"),
-        (SensorFile(sensors={"4": SensorEntry(), "6": SensorEntry()}), [], "the sensors 4, 6: name one with --sensor"),
-        (FILE, ["--sensor", "6"], "--sensor 6: the sensor file has 4"),
+        (
+            SensorFile(sensors={"4": SensorEntry(), "6": SensorEntry()}),
+            [],
+            "has the sensors 4, 6: name one of them with --sensor",
+        ),
+        (FILE, ["--sensor", "6"], "has the sensors 4: name one of them with --sensor"),
         (SensorFile(sensors={"4": SensorEntry()}), [], "nothing is known of this sensor, "),
         (REHEARSED, [], "has force of an emulated sensor 4, .*: write one of your sensor with edge-sr doctor --out"),
         (BEYOND, [], "thickness_mm of sensor 4 is 50, expected 3.1 to 7.2 of a pad that can be simulated: measure it"),
-        (
-            SensorFile("uSPa46", sensors={"4": SensorEntry(Mounting(taxel_count=24))}),
-            [],
-            "of a uSPa46, expected a uSPa44",
-        ),
+        (OTHER_PAD, [], "of a uSPa46, expected a uSPa44"),
         (FILE, [], "nothing to compare it on: .* pass --recordings or --taps, or --without-recordings"),
         (FILE, ["--beside", "x4.onnx"], "x4 is a model of 2 taps at x4, expected one of a single tap, or of several"),
         (FILE, ["--mesh", "none.stl"], "none.stl: cannot be read"),
