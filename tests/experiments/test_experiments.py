@@ -6,38 +6,19 @@ from experiment_samples import quick_bench, tables_of
 from train.experiments.__main__ import main, run
 from train.experiments.paper_tables import HELD_OUT, training_sets
 
-ERRORS = {"test PSNR dB", "run time ms"}
-COLUMNS = {
-    "table3": [ERRORS | {"method", "validation PSNR dB", "test SSIM", "parameters"}],
-    "table4": [ERRORS | {"scale"}],
-    "angle": [ERRORS | {"network", "angle deg", "over STSR dB"}],
-    "taps": [ERRORS | {"network", "taps given", "over STSR dB"}],
-    "unseen": [ERRORS | {"trained on", "tested on", "taps"}],
-    "families": [{"method", "run time us"}, {"family", "model, over"}, {"edge", "far"}],
-    "pads": [{"constant", "model, down", "model, all known, up"}],
-    "posed-taps": [
-        *[{"schedule", "taps", "over one tap"}] * 3,
-        {"off mm", "over one tap, not stated", "left out %, stated"},
-        {"model", "over one tap"},
-    ],
-    "nonnegative": [{"world", "known", "over one tap", "run time us"}],
-    "second-world": [{"method", "sinking, PSNR dB", "as drawn, wrong %"}, {"truth"}, {"sensor, after 10 %"}],
-    "blind-sensors": [{"patterns", "figures, over"}, {"sensor", "its own, all", "all families", "handed over"}],
-    "fig7": [{"method", "error %", "ms a pattern"}],
-}
-"""Some columns of the tables of each experiment that needs no recordings."""
+# Number of tables of each experiment that needs no recordings.
+TABLES = dict.fromkeys(("table3", "table4", "angle", "taps", "unseen", "pads", "nonnegative", "fig7"), 1)
+TABLES |= {"families": 3, "posed-taps": 5, "second-world": 3, "blind-sensors": 2}
 
 
 @pytest.mark.parametrize(
-    "name", [name if name.startswith("fig") else pytest.param(name, marks=pytest.mark.night) for name in COLUMNS]
+    "name", [name if name.startswith("fig") else pytest.param(name, marks=pytest.mark.night) for name in TABLES]
 )
 def test_it_runs_in_miniature(tmp_path, tmp_path_factory, name):
     page = run(name, quick_bench(tmp_path_factory), tmp_path)
     assert page.read_text().startswith(f"# {name}\n")
     tables = tables_of(page)
-    assert len(tables) == len(COLUMNS[name])
-    for rows, columns in zip(tables, COLUMNS[name], strict=True):
-        assert rows and columns <= set(rows[0])
+    assert len(tables) == TABLES[name] and all(len(rows[0]) > 1 for rows in tables)
 
 
 @pytest.mark.night

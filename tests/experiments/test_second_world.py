@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from firmware_bridge.pad_geometry import USPA44
-from train.experiments.second_world import draw_presses, movement, places, pressed
+from train.experiments.second_world import movement, places, pressed
 
 CELLS, RADIUS_MM, DEPTH_MM = 34, 4.0, 0.3
 CELL_MM = USPA44.width_mm / CELLS
@@ -47,10 +47,3 @@ def test_drag_moves_points_its_own_way_and_answers_to_pressure():
     far = np.hypot(moved[0, 0], moved[0, 1]) < 0.01
     for axis in (0, 1):
         assert moved[1 + axis, 2][far] == pytest.approx(-moved[0, axis][far], abs=1e-4)
-
-
-def test_another_series_is_of_the_same_sensors():
-    first, again, other = (draw_presses(5, 2, 3, series=series) for series in (0, 0, 1))
-    assert (first.frozen.presses.counts == again.frozen.presses.counts).all()
-    assert (first.frozen.gains == other.frozen.gains).all()
-    assert (first.frozen.presses.counts != other.frozen.presses.counts).any()

@@ -75,7 +75,7 @@ def test_a_slope_is_exact_at_every_pixel(angle_deg):
     assert 0 <= depth.min() <= 0.13 * np.sqrt(2) * CELL_MM / 2
 
 
-def test_a_letter_stands_upright_and_what_is_finer_than_a_cell_is_not_felt():
+def test_a_letter_stands_upright_and_finer_things_are_not_felt():
     letter = depth_image(relief("F"), CENTRE, 41, 0.5) < FIGURE_HEIGHT_MM / 2
     assert letter[:20].sum() > letter[21:].sum() and letter[:, :20].sum() > letter[:, 21:].sum()
     slab, needle = trimesh.creation.box([20, 20, 1]), trimesh.creation.box([0.2, 0.2, 3])
