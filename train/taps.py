@@ -46,10 +46,7 @@ _IMAGE_MM: Final = USPA44.rows * USPA44.pitch_mm  # side of a published depth im
 
 @one_thread()
 def tapped(paths: Sequence[Path], surfaces: Sequence[Surface], knowledge: Knowledge, entry: SensorEntry) -> PressSet:
-    """Return all frames of the taps in recordings, each of its surface, still without patterns; contact at FINE_SCALE.
-
-    The number of a frame's pad is that of its tap; the split is by place.
-    """
+    """Return all frames of the taps in recordings, each of its surface, without patterns; contact at FINE_SCALE."""
     gripped = GrippedPad(knowledge.middle())  # also of what is not known
     gains = np.reshape(knowledge.pad.gains or np.ones(USPA44.scan_shape), USPA44.scan_shape)
     parts: list[PressSet] = []
@@ -72,7 +69,7 @@ def tapped(paths: Sequence[Path], surfaces: Sequence[Surface], knowledge: Knowle
             say(f"{path}: {len(taps)} taps; {where.told()}")
         for tap, (surface, pose) in zip(tracked(taps, "what they touch", "tap"), under, strict=True):
             parts.append(_frames(tap, surface, pose, gripped, gains, path.stem))
-    made = join_presses(parts)
+    made = join_presses(parts)  # the number of a frame's pad is that of its tap
     numbers = {place: number for number, place in enumerate(dict.fromkeys(places))}
     if len(numbers) < FEWEST:
         raise DatasetError(f"taps at {len(numbers)} places, expected at least {FEWEST}; see the page on own models")

@@ -45,8 +45,7 @@ _RIDGE: Final = 1e-6
 def load_trust(path: Path, validation: PressSet | None = None) -> Trust:
     """Return the forward model and checks of a file of this command, or those of NAME.onnx with their limits.
 
-    Limits of the file's are set by `validation`, presses of several taps on pads of their own. CheckpointError if it is
-    absent, damaged, or without presses to set limits by.
+    The limits of a file's are set by `validation`, presses of several taps. CheckpointError if one of them is missing.
     """
     try:
         if path.suffix == ".onnx":
@@ -73,10 +72,7 @@ def _trust_of(model: onnx.ModelProto) -> Trust:
 
 
 def fit_trust(presses: PressSet, seed: int, contact_steps: int = 40_000, tap_steps: int = 20_000) -> dict[str, Any]:
-    """Fit forward model, check of contacts, and check of earlier taps by their poses; limits come at export.
-
-    DatasetError if no sequence has several taps.
-    """
+    """Fit forward model, check of contacts, and check of earlier taps, or DatasetError where all have one tap."""
     several = presses.pick(np.flatnonzero(presses.counts.any(axis=(2, 3, 4)).sum(axis=1) > 1))
     if not len(several):
         raise DatasetError("no sequences of several taps: add a file of 'make_presses --taps 4'")

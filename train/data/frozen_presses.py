@@ -56,10 +56,7 @@ class FrozenPresses:
         return FrozenPresses(self.presses.pick(index), self.gains[index])
 
     def as_frozen_set(self) -> FrozenSet:
-        """Return the set in the form of the runtime's evaluation: one frame a tap, without pad inputs.
-
-        It holds no poses, and so only the sequences whose taps were turned at one place, as the schedule states.
-        """
+        """Return the set as the runtime's evaluation has it: one frame a tap, of turns at one place alone."""
         turned = self.presses.only_turned()
         patterns = turned.patterns.astype(np.float32)
         depth_mm = turned.indentation_mm

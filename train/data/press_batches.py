@@ -1,7 +1,4 @@
-"""Batches of presses: a different sensor reads each window, with a random part of its constants as network input.
-
-Batches for a network that takes poses have one number of taps each, and poses with errors of a stated size.
-"""
+"""Batches of presses: a different sensor reads each window, with a random part of its constants as network input."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -33,10 +30,7 @@ class Batch:
     poses: Tensor | None = None  # (n, K, 5) of the taps in the newest one's axes, with their errors; None: a schedule
 
     def mirrored(self, which: Tensor) -> "Batch":
-        """Return the batch with mirror images, left for right, of some windows, (n,) of bool.
-
-        Without poses the windows are of one tap: a mirrored pad would turn the other way from tap to tap.
-        """
+        """Return the batch with mirror images, left for right, of some windows, (n,) of bool."""
 
         def flipped(maps: Tensor, vectors: bool) -> Tensor:
             image = maps.flip(-1)
@@ -219,7 +213,7 @@ def known_of_pads(
 
 
 class PosedBatches:
-    """Batches of windows with poses, pad inputs, and truth; DatasetError if there are no presses of so many taps."""
+    """Batches of windows of one number of taps each, with poses and pad inputs; DatasetError if there are none."""
 
     def __init__(self, presses: PressSet, given: tuple[float, ...], batch: int, seed: int) -> None:
         self._presses, self._seed = presses, seed

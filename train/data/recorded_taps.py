@@ -2,11 +2,7 @@
 
 A tap is followed from first touch to full force in up to FRAMES scans, at even steps of its summed z, over the free
 scans just before it, so that no drift is in it. The authors' files, .npy with an object array of dicts (`depth`, an
-image of the pad's area that is bright where it touches; `LRs`, (scans, 48) zeroed), hold a pickle. The loader knows
-arrays, lists, dicts and numbers alone, and calls nothing that a pickle names.
-
-Where the plate lies and how the pad is mounted is known to some tenths of a millimetre. These six numbers are fitted
-first: at the right ones the readings of all taps look like those of the simulated pad.
+image of the pad's area that is bright where it touches; `LRs`, (scans, 48) zeroed), hold a pickle.
 
 Source of the layout: Wu and Liu 2024, https://github.com/wmtlab/tactileSR.
 """
@@ -193,12 +189,11 @@ def _plain(held: Any) -> Any:
 
 
 _CORE: Final = {"_reconstruct": _Array, "scalar": lambda number, held: number.read(held)[0]}
-_CONSTRUCTORS: Final[dict[str, dict[str, Any]]] = {
+_CONSTRUCTORS: Final[dict[str, dict[str, Any]]] = {  # stand-ins for those that numpy's pickles name, by their modules
     "numpy": {"dtype": _Number, "ndarray": object},
     "numpy.core.multiarray": _CORE,
     "numpy._core.multiarray": _CORE,
 }
-"""Stand-ins for the constructors that numpy's pickles name, by their modules."""
 
 
 class _Arrays(pickle.Unpickler):
@@ -287,7 +282,7 @@ class Placed(NamedTuple):
     """Poses of the plate in the frame of the stated poses, and of the pad in its own, as fitted."""
 
     moved: NDArray[np.float64]  # (6,), x, y in [mm] and turn in [deg] of each
-    likeness: tuple[float, float] = (0.0, 0.0)  # median correlation of z with the simulated pad's, before and after
+    likeness: float = 0.0  # median correlation of z with the simulated pad's
 
     def __call__(self, pose: Pose) -> Pose:
         """Return the pose over the surface of a stated one."""
@@ -298,15 +293,17 @@ class Placed(NamedTuple):
     def told(self) -> str:
         """Return it in a line."""
         x_mm, y_mm, turn_deg, right_mm, down_mm, pad_deg = self.moved
-        before, after = self.likeness
         return (
             f"they fit best with the surface moved by {x_mm:.2f}, {y_mm:.2f} mm and {turn_deg:.1f} deg, the pad by "
-            f"{right_mm:.2f}, {down_mm:.2f} mm and {pad_deg:.1f} deg: likeness {before:.3f} -> {after:.3f}"
+            f"{right_mm:.2f}, {down_mm:.2f} mm and {pad_deg:.1f} deg: likeness {self.likeness:.3f}"
         )
 
 
 def placed(taps: Sequence[RecordedTap], surface: Surface, pad: GrippedPad) -> Placed:
-    """Fit the poses of plate and pad by Gauss-Newton; DatasetError if the readings do not fit the surface."""
+    """Fit the poses of plate and pad by Gauss-Newton; DatasetError if the readings do not fit the surface.
+
+    At the right ones the readings of all taps look like those of the simulated pad.
+    """
     some = [taps[number] for number in np.unique(np.linspace(0, len(taps) - 1, FIT_FROM).astype(int))]
     wanted = _shape(np.stack([tap.counts[-1, 2] for tap in some]))
 
@@ -314,15 +311,14 @@ def placed(taps: Sequence[RecordedTap], surface: Surface, pad: GrippedPad) -> Pl
         return _shape(pressed([Placed(moved)(tap.pose) for tap in some], surface, pad).counts[:, -1, 2])
 
     moved, now = np.zeros(6), made(np.zeros(6))
-    before = float(np.median((now * wanted).sum(axis=1)))
     for _ in range(3):
         slopes = np.stack([(made(moved + step) - now).ravel() / step.sum() for step in np.diag(_STEPS)], axis=1)
         moved = moved + np.linalg.lstsq(slopes, (wanted - now).ravel(), rcond=1e-3)[0].clip(-2, 2)
         now = made(moved)
-    fitted = Placed(moved, (before, float(np.median((now * wanted).sum(axis=1)))))
-    if not fitted.likeness[1] >= LEAST_LIKENESS:
+    fitted = Placed(moved, float(np.median((now * wanted).sum(axis=1))))
+    if not fitted.likeness >= LEAST_LIKENESS:
         raise DatasetError(
-            f"the readings do not fit what lies under the poses: likeness {fitted.likeness[1]:.2f}, at least "
+            f"the readings do not fit what lies under the poses: likeness {fitted.likeness:.2f}, at least "
             f"{LEAST_LIKENESS} expected; are the poses those of this surface, from its middle, in mm, y down?"
         )
     return fitted

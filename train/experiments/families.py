@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 from timeit import repeat
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,13 +41,6 @@ _NEAREST: Final = 8
 _AT_ONCE: Final = 64
 
 
-class Found(NamedTuple):
-    """Errors of one method on the wide test set, and its run time."""
-
-    figures: dict[str, NDArray[np.float64]]  # every metric, (n,) each
-    run_time_us: float
-
-
 def families(bench: Workbench, report: Report) -> None:
     """Evaluate the shipped model and its intervals on every family, next to baselines."""
     wide = bench.wide_test()
@@ -59,12 +52,13 @@ def families(bench: Workbench, report: Report) -> None:
     baselines |= {f"nearest {_NEAREST}": nearest_presses(read, training.patterns)}
     inferred = {name: infer_presses(model, wide, known) for known, name in SHORT.items()}
     frozen, own = wide.as_frozen_set(), model.contract.contact_level
-    found = {name: Found(judge(one.patterns, frozen, own), one.run_time_us) for name, one in inferred.items()}
+    found = {name: judge(one.patterns, frozen, own) for name, one in inferred.items()}
+    times_us = {name: one.run_time_us for name, one in inferred.items()}
     for name, run in tracked(baselines.items(), "judging", "baseline"):
         newest = wide.windows(1)[:, 0]
         level = best_contact_level(run(read[:_LEVELLED]), training.touching[:_LEVELLED])
         times_s = [min(repeat(partial(run, scan[None]), number=1, repeat=3)) for scan in newest[:100]]
-        found[name] = Found(judge(run(newest), frozen, level), 1e6 * float(np.median(times_s)))
+        found[name], times_us[name] = judge(run(newest), frozen, level), 1e6 * float(np.median(times_s))
 
     report.say(
         f"{name_of(model)}, through the runtime's session, one tap. "
@@ -84,9 +78,9 @@ def families(bench: Workbench, report: Report) -> None:
             "IoU": round(float(figures["contact_iou"].mean()), 3),
             "edge mm": round(float(figures["boundary_mm"].mean()), 3),
             "RMSE %": round(float(figures["rmse_percent"].mean()), 2),
-            "run time us": round(run_time_us),
+            "run time us": round(times_us[name]),
         }
-        for name, (figures, run_time_us) in found.items()
+        for name, figures in found.items()
     ]
     report.table(rows, "All families.")
     report.table(_family_rows(found, wide), f"PSNR in dB by family; `over` is over {_BEST}, press by press.")
@@ -114,11 +108,11 @@ def nearest_presses(known: NDArray[np.float32], patterns: NDArray[np.float16]) -
     return nearest
 
 
-def _family_rows(found: Mapping[str, Found], wide: FrozenPresses) -> list[Row]:
+def _family_rows(found: Mapping[str, Mapping[str, NDArray[np.float64]]], wide: FrozenPresses) -> list[Row]:
     """Return the PSNR of every method by family and in total, and the model's margin over the best baseline."""
     rows: list[Row] = []
     for family, which in _families(wide):
-        found_db = {name: one.figures["psnr_db"][which] for name, one in found.items()}
+        found_db = {name: figures["psnr_db"][which] for name, figures in found.items()}
         pads = wide.presses.pad[which]
         row: Row = {"family": family, "presses": int(which.sum())}
         for name, values in found_db.items():

@@ -27,12 +27,10 @@ from train.report import Report, Row, with_interval
 from train.surfaces.poses import MAX_TAPS
 
 SCHEDULES: Final = ("half-pitch", "near", "turns", "slide")
+# The paper's own comparison: its figures, the nominal pad, turned by 5 degrees (Wu and Liu 2024, Fig. 13).
 PAPER: Final = World(
     count=720, taps=MAX_TAPS, schedule="turns", begun=0.0, families={"paper": 1.0}, spread=0.0, seed=2_000_029
 )
-"""The paper's own comparison: its figures, the nominal pad, turned by 5 degrees from tap to tap.
-
-Source: Wu and Liu 2024, Fig. 13."""
 USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)  # errors of poses, in [mm] and [deg], where a robot states none
 _WINDOW: Final = 4
 

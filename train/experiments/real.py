@@ -1,9 +1,7 @@
 """Real grips through the shipped runtime: coverage of a face over the whole pad.
 
-Recordings go through edge.perception.runtime with the default model and the baseline of a free pad. Their true patterns
-are unknown, but both fingers hold a flat face that covers the pad: a pattern should cover it, evenly and without a
-hole. They are read from TACTILE_RECORDINGS, or from next to the repository; no reading of theirs goes into a report,
-patterns do.
+Their true patterns are unknown, but both fingers hold a flat face: a pattern should cover the pad, evenly and without a
+hole. They are read from TACTILE_RECORDINGS; no reading of theirs goes into a report, patterns do.
 """
 
 from collections.abc import Sequence

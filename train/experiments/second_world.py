@@ -209,8 +209,8 @@ def second_world(bench: Workbench, report: Report) -> None:
     between = with_interval(psnr_db(drawn(test), test.frozen.patterns(), MAX_INDENTATION_MM), mine)
     report.say(
         f"{name_of(model)} and {name_of(posed)}, through the runtime's session. {len(test.frozen)} presses of "
-        f"{sensors} sensors on an elastic half-space (seed {SEEDS[1]}); what is "
-        f"fitted is fitted on as many presses of other sensors (seed {SEEDS[0]}), by each truth. PSNR in dB, full "
+        f"{sensors} sensors on an elastic half-space (seed {SEEDS[1]}); what is fitted is fitted on as many presses of "
+        f"other sensors (seed {SEEDS[0]}), by each truth. PSNR in dB, full "
         f"scale {MAX_INDENTATION_MM} mm, by two truths: how far the surface sinks in this world, and what training "
         "would have drawn for the same contacts, around which the surface rises within 1.3 mm. They are "
         f"{between} dB from each other. Wrong: an RMS error over {WRONG:.0%} of the RMS of the truth. 95 % intervals "
@@ -273,7 +273,7 @@ def _ways(
     matrix = fit_linear_map(readings(other), wanted.reshape(len(wanted), -1), 1e-2)
     yield "linear map fitted in this world", lambda one: (readings(one) @ matrix).reshape(-1, *wanted.shape[1:]), "-"
     plain, name = all_alike(None), model.name
-    yield from ((name, plain, whose) for whose in ("-", "the world", "each sensor", "each pattern"))
+    yield from ((name, plain, whose) for whose in ("-", "the world", "each sensor"))
     yield f"{name}, counts per newton by a weight", told(weighed), "the world"
     yield f"{name}, its own contacts learned", told(by_contacts), "the world"
     pad = Pad()
@@ -291,8 +291,6 @@ def _gains(maps: _Array, truth: Run, run: Run, whose: str, other: Pressed, own: 
     gains = np.ones(len(maps))
     if whose == "the world":
         gains[:] = fit_gain(run(other), truth(other))
-    if whose == "each pattern":  # by its own truth: a bound
-        gains = np.array([fit_gain(*pair) for pair in zip(maps, truth(test), strict=True)])
     if whose == "each sensor":
         sensors = own.frozen.presses.pad
         few = own.pick(np.arange(len(sensors)) - np.searchsorted(sensors, sensors) < _SHAPES)

@@ -173,8 +173,7 @@ def contacts_of(sensors: FrozenPresses) -> list[NDArray[np.int64]]:
 def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Sequence[Pad | None]) -> Row:
     """Return the verdicts on each sensor's contacts (n, 3, rows, cols) in their order, with what its file holds.
 
-    They are shares of the contacts, of which too light ones are not checked, and of the sensors with more contacts than
-    AFTER that were suspected by then, as cells of a row.
+    They are shares of the contacts, and of the sensors with more contacts than AFTER that were suspected by then.
     """
     rows, suspected = list[tuple[int, str, bool]](), list[bool]()
     for number, (contacts, pad) in enumerate(zip(sensors, pads, strict=True)):

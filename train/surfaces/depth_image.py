@@ -1,8 +1,4 @@
-"""Depth images: depth of a surface under the pad below the point that the pad touches first.
-
-A pose turns the surface's triangles into the pad's axes; those whose bounding box meets the footprint are drawn
-straight onto the requested grid, so that every pixel's depth is exact at the pixel's centre.
-"""
+"""Depth images: depth of a surface under the pad below the point that the pad touches first, exact at each pixel."""
 
 from math import cos, radians, sin
 from typing import Final, NamedTuple
@@ -12,8 +8,7 @@ import trimesh
 from numpy.typing import NDArray
 
 NOTHING_MM: Final = 1e3  # depth where there is no surface at all: out of any press's reach
-_UNFELT_MM: Final = 0.05
-"""Height above the cells' centres from which a point between them counts as finer than a cell, in [mm]."""
+_UNFELT_MM: Final = 0.05  # height above the cells' centres from which a point between them is finer than a cell
 _ROUNDING_PX: Final = 1e-9  # tolerance in [px], so that no pixel on the common edge of two triangles is missed
 
 
@@ -45,10 +40,8 @@ def depth_image(relief: Relief, pose: Pose, size: int, cell_mm: float) -> NDArra
     """Return the depth (size, size) in [mm] of the part of a surface under a pad of `size` x `size` cells.
 
     Rows go down the pad from the top left; the sensor's y points down its rows, the surface's y up: the pad faces the
-    surface. Off the surface the depth is NOTHING_MM. Depth counts from the highest point under the footprint, not under
-    the mesh: indentation is measured from first contact. Between the cells' centres that point is searched on the
-    triangles' edges; a point there that stands out by more than _UNFELT_MM is finer than a cell and is left out.
-    ValueError if nothing lies under the pad.
+    surface. Off the surface the depth is NOTHING_MM. Depth counts from first contact, the highest point under the
+    footprint, also between the cells' centres, on the triangles' edges. ValueError if nothing lies under the pad.
     """
     width_mm = size * cell_mm
     triangles = _under(relief, pose, width_mm)

@@ -1,10 +1,8 @@
 """Surfaces to tap, by name: the paper's 18, random figures, and users' meshes.
 
-A surface is a flat figure raised from a square base plate. Lengths in [mm]; the figure's top is the plane z = 0, the
-plate's top lies FIGURE_HEIGHT_MM below it. The paper's figures are nine letters, and three shapes in three forms; it
-does not state their exact sizes, and those here are our choice. A seed defines one random figure: coordinates are
-rounded to whole micrometres, which removes the last digits in which machines differ. Detail that no tap could resolve,
-slits and slivers finer than half a millimetre, is left out.
+A surface is a flat figure raised from a square base plate; its top is the plane z = 0. The paper does not state the
+sizes of its nine letters, and three shapes in three forms: those here are our choice. A seed defines one random figure:
+coordinates are rounded to whole micrometres, which removes the last digits in which machines differ.
 
 Source: Wu and Liu 2024, Fig. 1c (two plates of nine surfaces).
 """

@@ -1,9 +1,5 @@
 """Poses of the taps on a surface: the paper's schedule, poses drawn at random, and schedules of further taps.
 
-The paper taps each surface at nine positions, turned nine ways. A target is a tap whose pattern is reconstructed; the
-taps before it are made at the same place, each turned back by one more angle step. Targets are split by position: one
-for the test and one for validation, 72 targets each, the same for every K.
-
 A schedule says where the pad was in earlier taps, in the newest one's axes, newest tap first: x, y in [mm] and a turn
 in [deg], as in `firmware_bridge.poses`.
 """
