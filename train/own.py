@@ -48,7 +48,7 @@ from train.learning.training_loop import Recipe
 from train.physics.gripped import SCALE
 from train.physics.pad_draws import KNOWN, RANGES, SIMULATED, constants
 from train.physics.pad_draws import Pad as SimulatedPad
-from train.report import bootstrap_interval
+from train.report import Row, bootstrap_interval, markdown
 from train.surfaces.meshes import mesh_name, size_of
 
 _FIFTH: Final = 0.2  # share of a range that a constant without an interval is known to, and by which pads are unlike it
@@ -184,9 +184,10 @@ def compared(
     bundled = ModelSession(find_model(DEFAULT_MODEL))
     sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled} | dict(beside)
     bilinear = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"]
-    cells: dict[str, list[str]] = {name: [] for name in (*models, "bilinear")}
+    over, below = f"over {bundled.name}", "pads below it"
+    rows: dict[str, Row] = {name: {"method": name} for name in (*models, "bilinear", over, below)}
     times_us: dict[str, list[float]] = {name: [] for name in models}
-    gains, losing, objections = dict[str, str](), dict[str, float](), list[str]()
+    gains, losing, objections = dict[str, str](), 0.0, list[str]()
     for what, presses in sets.items():
         as_read = FrozenPresses(presses, np.ones(0, dtype=np.float32))
         frozen = as_read if what == TAPPED else freeze_presses(presses, SEED + 1, sensor.nuisances)
@@ -200,39 +201,35 @@ def compared(
                 times_us[name].append((time.perf_counter_ns() - begun_ns) / 1000)
         errors = {name: psnr_db(made, truth, own.contract.output_full_scale) for name, made in patterns.items()}
         for name, values in errors.items():
-            cells[name].append(f"{values.mean():.2f}")
+            rows[name][f"{what} [dB]"] = f"{values.mean():.2f}"
             gained = errors[OWN] - values
             low, high = bootstrap_interval(gained, presses.pad)
             gain = f"{gained.mean():+.2f} ({low:+.2f} to {high:+.2f})"
             if name == bundled.name:
                 gains[what], pads = gain, np.unique(presses.pad)
-                losing[what] = float(np.mean([gained[presses.pad == pad].mean() < 0 for pad in pads]))
+                losing = float(np.mean([gained[presses.pad == pad].mean() < 0 for pad in pads]))
+                rows[over][f"{what} [dB]"], rows[below][f"{what} [dB]"] = gain, f"{losing:.0%}"
             # One that is made for a wider range is better outside of what is known by now.
             decides = name in (bundled.name, "bilinear") or what == TAPPED or (name == REPLACED and what != UNLIKE)
             if name != OWN and decides and (high < 0 if what == UNLIKE or name == REPLACED else low <= 0):
                 objections.append(f"on {what} it is {gain} dB to {name}")
-        if TAPPED not in sets and what != UNLIKE and losing[what] > MOST_LOSING:  # taps show which pad it is
+        if TAPPED not in sets and what != UNLIKE and losing > MOST_LOSING:  # taps show which pad it is
             objections.append(
-                f"on {what} it is below {bundled.name} on {losing[what]:.0%} of the pads that this may be, expected at "
+                f"on {what} it is below {bundled.name} on {losing:.0%} of the pads that this may be, expected at "
                 f"most {MOST_LOSING:.0%}" + ": train on taps of the sensor (train.taps)" * bool(knowledge.pad.constants)
             )
     holes = {name: np.array([_holes(grip, model, knowledge.pad) for grip in grips]) for name, model in models.items()}
     for name, shares in holes.items() if grips else ():
-        cells[name].append(f"{shares.mean():.1%}")
+        rows[name]["recordings with holes"] = f"{shares.mean():.1%}"
     for grip, mine, theirs in zip(grips, holes[OWN], holes[bundled.name], strict=True):
         if not mine <= theirs:
             objections.append(
                 f"in {grip.trial} {mine:.1%} of its patterns have holes, {theirs:.1%} of {bundled.name}'s: the sensor "
                 "is not as in the sensor file; lay a weight on it with edge-sr doctor"
             )
-    names = [f"{what} [dB]" for what in sets] + ["recordings with holes"] * bool(grips)
-    lines = [" | ".join(("method", *names, "run time [us]"))]
-    cells[f"over {bundled.name}"] = [*gains.values()]
-    cells["pads below it"] = [f"{share:.0%}" for share in losing.values()]
-    for name, row in cells.items():
-        run_us = f"{np.median(times_us[name]):.0f}" if name in times_us else "-"
-        lines.append(" | ".join((name, *row, *["-"] * (len(names) - len(row)), run_us)))
-    return Comparison("\n".join(lines), "; ".join(objections) or None, gains)
+    for name, times in times_us.items():
+        rows[name]["run time [us]"] = round(float(np.median(times)))
+    return Comparison(markdown([*rows.values()]), "; ".join(objections) or None, gains)
 
 
 def _holes(grip: Grip, model: ModelSession, pad: Pad) -> float:
