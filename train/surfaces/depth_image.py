@@ -26,14 +26,8 @@ class Relief:
     def __init__(self, name: str, mesh: trimesh.Trimesh) -> None:
         self.name = name
         self.triangles_mm = np.asarray(mesh.triangles, dtype=np.float64)
-        self._low_mm = self.triangles_mm[:, :, :2].min(axis=1)
-        self._high_mm = self.triangles_mm[:, :, :2].max(axis=1)
-
-    def near(self, pose: Pose, reach_mm: float) -> NDArray[np.float64]:
-        """Return triangles (t, 3, 3) whose bounding box comes within `reach_mm` of a pose's centre, in x and in y."""
-        place = np.array([pose.x_mm, pose.y_mm])
-        meets = (self._low_mm <= place + reach_mm) & (self._high_mm >= place - reach_mm)
-        return self.triangles_mm[meets.all(axis=1)]
+        self.low_mm = self.triangles_mm[:, :, :2].min(axis=1)
+        self.high_mm = self.triangles_mm[:, :, :2].max(axis=1)
 
 
 def depth_image(relief: Relief, pose: Pose, size: int, cell_mm: float) -> NDArray[np.float32]:
@@ -58,7 +52,9 @@ def depth_image(relief: Relief, pose: Pose, size: int, cell_mm: float) -> NDArra
 
 def _under(relief: Relief, pose: Pose, width_mm: float) -> NDArray[np.float64]:
     """Return triangles (t, 3, 3) in the pad's axes, limited to those whose bounding box there meets the footprint."""
-    triangles_mm = relief.near(pose, width_mm / np.sqrt(2))
+    place, reach_mm = np.array([pose.x_mm, pose.y_mm]), width_mm / np.sqrt(2)
+    near = (relief.low_mm <= place + reach_mm) & (relief.high_mm >= place - reach_mm)
+    triangles_mm = relief.triangles_mm[near.all(axis=1)]
     cosine, sine = cos(radians(pose.angle_deg)), sin(radians(pose.angle_deg))
     x_mm, y_mm = triangles_mm[:, :, 0] - pose.x_mm, triangles_mm[:, :, 1] - pose.y_mm
     turned = np.stack([cosine * x_mm + sine * y_mm, sine * x_mm - cosine * y_mm, triangles_mm[:, :, 2]], axis=2)
