@@ -104,7 +104,6 @@ def _detected(model: ModelSession, sensors: FrozenPresses) -> list[Row]:
     nothing: list[Pad | None] = [None] * len(contacts)
     given: dict[str, tuple[Sequence[NDArray[np.floating]], Sequence[Pad | None]]] = {
         "no fault": (readings, nothing),
-        "no fault, its own file": (readings, own),
         "another pad's file": (readings, [*own[1:], own[0]]),
     }
     for name, fault in FAULTS.items():
@@ -175,23 +174,22 @@ def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Seq
 
     They are shares of the contacts, and of the sensors with more contacts than AFTER that were suspected by then.
     """
-    rows, suspected = list[tuple[int, str, bool]](), list[bool]()
+    rows, suspected = list[tuple[int, str]](), list[bool]()
     for number, (contacts, pad) in enumerate(zip(sensors, pads, strict=True)):
         pushed, seen = PushedSensor(model, pad, seed=number), 0
         for counts in contacts:
             result = pushed.touch(counts)
             if result.pattern is None:
                 continue
-            rows.append((number, result.untrusted_reason or "", result.trusted is not None))
+            rows.append((number, result.untrusted_reason or ""))
             pushed.free()  # it brings the events of the contact, which follow from the evidence of those before
             if seen == AFTER:
                 suspected.append(pushed.suspected)
             seen += 1
     if not rows:
         return {"contacts": 0}
-    sensor, reason, checked = map(np.array, zip(*rows, strict=True))
-    flagged = share(np.isin(reason, _OWN), sensor)
-    row: Row = {"contacts": len(rows), "too light": int((~checked).sum()), "flagged %": flagged}
+    sensor, reason = map(np.array, zip(*rows, strict=True))
+    row: Row = {"contacts": len(rows), "flagged %": share(np.isin(reason, _OWN), sensor)}
     row |= {f"{name} %": round(100 * float((reason == name).mean()), 1) for name in _OWN[1:]}
     return row | {f"sensor, after {AFTER} %": share(np.array(suspected)) if suspected else None}
 
@@ -214,8 +212,7 @@ def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> 
 
 Counts = NDArray[np.float32]  # readings of one sensor, (n, 3, rows, cols), zeroed
 Fault = Callable[[np.random.Generator, Counts], Counts]  # readings of one sensor as a fault changes them
-Field = Callable[[np.random.Generator], Counts]
-"""Counts (3, rows, cols) that something near the pad adds to each reading."""
+Field = Callable[[np.random.Generator], Counts]  # what something near the pad adds to each reading, (3, rows, cols)
 
 _MAGNET_MM, _CHIP_MM, _PAD_TOP_MM = 2.5, 0.5, 4.5
 _MOVES: Final = (
@@ -230,15 +227,13 @@ def steel_field(rng: np.random.Generator) -> NDArray[np.float32]:
     The image of an upright magnet in a plate is upright too, as far above the plate as the magnet is below. The plate
     is wider than the pad, leans by up to eleven degrees, and its largest count is drawn, as a far magnet's is.
     """
-    across_mm = (np.arange(USPA44.cols) - (USPA44.cols - 1) / 2) * USPA44.pitch_mm
-    x_mm, y_mm = (part.ravel() for part in np.meshgrid(across_mm, across_mm))
+    x_mm, y_mm = USPA44.taxel_centres_mm().T
     slope = rng.uniform(-0.2, 0.2, 2)
     lean_mm = slope[0] * x_mm + slope[1] * y_mm
     gap_mm = rng.uniform(1.0, 8.0) + lean_mm - lean_mm.min()
     image_mm = 2 * (_PAD_TOP_MM + gap_mm) - _MAGNET_MM
-    away = np.stack(
-        [x_mm[:, None] - x_mm, y_mm[:, None] - y_mm, np.broadcast_to(_CHIP_MM - image_mm, (16, 16))]
-    )  # (3, chips, images)
+    below_mm = np.broadcast_to(_CHIP_MM - image_mm, (16, 16))
+    away = np.stack([x_mm[:, None] - x_mm, y_mm[:, None] - y_mm, below_mm])  # (3, chips, images)
     square = (away**2).sum(axis=0)
     field = 3 * away * away[2] / square**2.5
     field[2] -= square**-1.5
