@@ -1,7 +1,7 @@
 """Recordings as a controller would send them: of the demo, and of two fingers that grip things."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -203,8 +203,7 @@ def _magnet() -> NDArray[np.float32]:
     distance_mm = (far + (near - far) * course)[:, None, None]
     x_mm, y_mm, z_mm = (distance_mm * part / math.hypot(*_TOWARDS) for part in _TOWARDS)
     east, south, up = (np.array(part / math.hypot(*_MOMENT)) for part in _MOMENT)
-    chip_x_mm = (np.arange(USPA44.cols) - (USPA44.cols - 1) / 2) * USPA44.pitch_mm
-    chip_y_mm = (np.arange(USPA44.rows) - (USPA44.rows - 1) / 2)[:, None] * USPA44.pitch_mm
+    chip_x_mm, chip_y_mm = USPA44.taxel_centres_mm().T.reshape(2, USPA44.rows, USPA44.cols)
     field_mt = dipole_mt(Magnet(), (chip_x_mm - x_mm, chip_y_mm - y_mm, -z_mm), (east, south, up))
     field = np.stack(np.broadcast_arrays(*field_mt), axis=1)
     field -= field[-1]
@@ -217,18 +216,6 @@ _FREE, _CLOSE, _HOLD, _OPEN = 130, 25, 150, 25  # scans before and after each gr
 _STEP: Final = 5  # scans from one solved press to the next; those between are interpolated
 _FORCE_N: Final = 8.0
 _DRIFT_COUNTS_PER_S: Final = 2.0  # of z, as a pad warms in a grip
-
-# Height in [mm] at places of x and y in [mm], as one finger sees it.
-Shape = Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.floating]]
-
-
-def _pen(x_mm: NDArray[np.floating], y_mm: NDArray[np.floating]) -> NDArray[np.floating]:
-    return -((x_mm * np.cos(0.4) + y_mm * np.sin(0.4)) ** 2) / (2 * 6.0)
-
-
-def _nut(x_mm: NDArray[np.floating], y_mm: NDArray[np.floating]) -> NDArray[np.floating]:
-    away = np.hypot(x_mm - 1.0, y_mm)
-    return np.where((away > 3.0) & (away < 7.0), 0.0, -2.0)
 
 
 def grip_recording() -> dict[str, NDArray]:
@@ -250,8 +237,13 @@ def _finger(number: int) -> NDArray[np.float64]:
     """Return the raw counts (n, 3, rows, cols) of one finger; the second sees everything mirrored."""
     rng = np.random.default_rng([SEED, 4, number])
     pad = GrippedPad(draw_pad(rng))
+    x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
+    x_mm = -x_mm if number == 1 else x_mm
+    away_mm = np.hypot(x_mm - 1.0, y_mm)
+    pen = -((x_mm * np.cos(0.4) + y_mm * np.sin(0.4)) ** 2) / (2 * 6.0)
+    nut = np.where((away_mm > 3.0) & (away_mm < 7.0), 0.0, -2.0)
     free = np.zeros((_FREE, *USPA44.scan_shape))
-    clean = np.concatenate([free, *(part for shape in (_pen, _nut) for part in (_grip(pad, shape, number == 1), free))])
+    clean = np.concatenate([free, _grip(pad, pen), free, _grip(pad, nut), free])
     duration_s = len(clean) / RATE_HZ
     read = apply_nuisances(clean[None, None].astype(np.float32), _SENSOR, int(rng.integers(2**31)), tap_s=duration_s)
     warming = np.array([0.0, 0.0, 1.0])[:, None, None] * _DRIFT_COUNTS_PER_S * rng.uniform(0.5, 1)
@@ -260,10 +252,9 @@ def _finger(number: int) -> NDArray[np.float64]:
     return np.rint(rest + read[0, 0] + drift)
 
 
-def _grip(pad: GrippedPad, shape: Shape, mirrored: bool) -> NDArray[np.float32]:
+def _grip(pad: GrippedPad, heights_mm: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return clean counts of one grip: it closes to its force, is lifted, which drags the pad down, and opens."""
-    x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
-    heights_mm = shape(-x_mm if mirrored else x_mm, y_mm).astype(np.float32)
+    heights_mm = heights_mm.astype(np.float32)
     share = np.concatenate([np.linspace(0, 1, _CLOSE), np.ones(_HOLD), np.linspace(1, 0, _OPEN)])
     drag_mm = 0.15 * np.clip((np.arange(len(share)) - _CLOSE - _HOLD / 4) / (_HOLD / 4), 0, 1)
     solved = np.unique(np.append(np.arange(1, len(share) - 1, _STEP), len(share) - 2))
