@@ -4,7 +4,7 @@ Faults are the same in all contacts of a sensor: fields near the pad, wrong plac
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -45,8 +45,6 @@ def trust_checks(bench: Workbench, report: Report) -> None:
             raise CheckpointError(f"{one.name} has no checks: export it with --trust")
     wide = bench.wide_test()
     wide = wide.pick(np.arange(12)) if bench.quick else wide
-    # A third of the sensors is enough for the faults, and half of the presses to compare models.
-    sensors = of_one_sensor_each(wide.pick(wide.presses.pad % 3 == 0))
     fresh = freeze_presses(bench.presses("judged", JUDGED), SEED)
     verdicts = judged(model, fresh, known_pads(fresh, False))
     report.say(
@@ -64,12 +62,12 @@ def trust_checks(bench: Workbench, report: Report) -> None:
         "Fresh contacts by family, every press of a sensor of its own. `light`: a summed z of 750 to 1500 counts, in "
         "which a contact can end, but not begin; the other rows leave them out.",
     )
-    half = fresh.pick(np.arange(0, len(fresh), 2))
+    half = fresh.pick(np.arange(0, len(fresh), 2))  # which is enough to compare models
     report.table(_by_model(models, half), "Half of these contacts by model, one tap each, of all families.")
     if recording_paths(recordings_folder()):
         report.table(_grips(models), "Scans of real grips under load, both fingers: not believed, wanted at most 3 %.")
     report.table(
-        _detected(model, sensors),
+        _detected(model, wide.pick(wide.presses.pad % 3 == 0)),
         "Faults of a sensor, the same in all of its eleven contacts, of the wide test set. Fields have 150 to 1500 "
         "counts on the reading where they are largest, and come after zeroing. `another pad's file`: constants and "
         "gains of another sensor, stated as certain. `sensor, after 10`: sensors that ten contacts have made "
@@ -97,11 +95,15 @@ def _grips(models: Sequence[ModelSession]) -> list[Row]:
     return rows
 
 
-def _detected(model: ModelSession, sensors: FrozenPresses) -> list[Row]:
-    contacts = contacts_of(sensors)
-    readings = [sensors.presses.counts[mine, 0] for mine in contacts]
-    own = [sensors.pad(int(mine[0]), gains=True) for mine in contacts]
-    nothing: list[Pad | None] = [None] * len(contacts)
+def _detected(model: ModelSession, wide: FrozenPresses) -> list[Row]:
+    pads, first, place = np.unique(wide.presses.pad, return_index=True, return_inverse=True)
+    of_one_sensor = (wide.gains[first][place] / wide.gains).astype(np.float32)  # in place of one for each press
+    counts = wide.presses.counts[:, 0] * of_one_sensor
+    firm = counts[:, 2].sum(axis=(1, 2)) >= ON_COUNTS
+    contacts = [np.flatnonzero(firm & (wide.presses.pad == pad)) for pad in pads]
+    readings = [counts[np.resize(mine, CONTACTS)] for mine in contacts if len(mine)]  # few firm ones are repeated
+    own = [wide.pad(int(number), gains=True) for number, mine in zip(first, contacts, strict=True) if len(mine)]
+    nothing: list[Pad | None] = [None] * len(readings)
     given: dict[str, tuple[Sequence[NDArray[np.floating]], Sequence[Pad | None]]] = {
         "no fault": (readings, nothing),
         "another pad's file": (readings, [*own[1:], own[0]]),
@@ -152,21 +154,6 @@ def share(hits: NDArray[np.bool_], groups: NDArray[np.integer] | None = None) ->
         count = len(np.unique(groups))
         low, high = (0.0, beta.ppf(0.975, 1, count)) if mean == 0 else (beta.ppf(0.025, count, 1), 1.0)
     return f"{100 * mean:.1f} ({100 * low:.1f}..{100 * high:.1f})"
-
-
-def of_one_sensor_each(wide: FrozenPresses) -> FrozenPresses:
-    """Return the presses with the gains of one sensor for each pad, in place of those of a sensor for each press."""
-    _, first, place = np.unique(wide.presses.pad, return_index=True, return_inverse=True)
-    gains = wide.gains[first][place]
-    return FrozenPresses(replace(wide.presses, counts=wide.presses.counts * (gains / wide.gains)[:, None]), gains)
-
-
-def contacts_of(sensors: FrozenPresses) -> list[NDArray[np.int64]]:
-    """Return the presses that make the contacts of each sensor; one with few firm presses repeats them."""
-    firm = sensors.presses.counts[:, 0, 2].sum(axis=(1, 2)) >= ON_COUNTS
-    pads = sensors.presses.pad
-    mine = [np.flatnonzero(firm & (pads == pad)) for pad in np.unique(pads)]
-    return [np.resize(presses, CONTACTS) for presses in mine if len(presses)]
 
 
 def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Sequence[Pad | None]) -> Row:
