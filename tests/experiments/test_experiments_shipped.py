@@ -10,9 +10,10 @@ from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 
 from edge.inference.bundled import DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
+from firmware_bridge.errors import RecordingError
 from train.data.frozen_presses import load_frozen_presses
 from train.data.real_grips import has_hole, recorded_contacts, share_touched, unevenness
-from train.errors import CheckpointError, DatasetError
+from train.errors import CheckpointError
 from train.experiments.__main__ import run
 from train.experiments.trust_checks import CONTACTS, FAULTS, judged, share, verdicts_on
 from train.experiments.workbench import infer_presses
@@ -45,7 +46,7 @@ def test_recordings_are_zeroed_by_the_trial_that_lets_go(recordings):
     assert set(found) == {"xela_sensor1", "xela_sensor2"}
     np.testing.assert_array_equal(found["xela_sensor1"], np.concatenate([grip(False), grip(True)])[~again])
     (recordings / "trial-a" / "xela_sensor1.csv").write_text("nothing\n")
-    with pytest.raises(DatasetError, match=r"trial-a/xela_sensor1\.csv, line 1"):
+    with pytest.raises(RecordingError, match=r"trial-a/xela_sensor1\.csv, line 1"):
         recorded_contacts(recordings)
 
 

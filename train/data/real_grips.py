@@ -15,7 +15,6 @@ from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import load_estimator
-from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
@@ -81,7 +80,7 @@ def check_track(recording: Recording, track: Track, entry: SensorEntry) -> None:
 
 
 def recorded_grips(folder: Path, known: SensorFile = _UNKNOWN) -> list[Grip]:
-    """Load the recordings of sensors as a sensor file has them mounted; DatasetError if there are none of such.
+    """Load the recordings of sensors as a sensor file has them mounted, or raise a DatasetError or RecordingError.
 
     The rest level is taken from the end of the trial that ends with the least load: there the grip was released.
     """
@@ -121,10 +120,7 @@ def grips_of(folder: Path, sensor: str, known: SensorFile) -> list[Grip]:
 
 def _placed_counts(path: Path, entry: SensorEntry) -> NDArray[np.integer]:
     """Return the raw counts of a CSV, whose taxels are in the order of the id map, with each taxel in its place."""
-    try:
-        recording = load_recording(path)
-    except RecordingError as error:
-        raise DatasetError(str(error)) from error
+    recording = load_recording(path)
     check_track(recording, recording.tracks[0], entry)
     return entry.mounting.place_counts(recording.tracks[0].counts)
 
