@@ -35,7 +35,7 @@ def make_presses(world: World, path: Path) -> PressSet:
     """Solve the presses of a world, on all cores, and write them; an interrupted call resumes.
 
     Where there are several pads, call it from the main thread, and from a script only under its guard of `__main__`.
-    DatasetError if files there were made otherwise or cannot be written.
+    DatasetError if files there were made otherwise.
     """
     facts = world.facts()
     if path.exists():
@@ -43,10 +43,7 @@ def make_presses(world: World, path: Path) -> PressSet:
             raise DatasetError(f"{path} exists and was made with other settings: delete it, or write to another file")
         return there
     folder = path.with_name(path.name + ".parts")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetError(f"{folder} cannot be made: {error.strerror}") from error
+    folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{number:06d}.npz" for number in range(world.chunks)]
     parts = {number: load_presses(path) for number, path in enumerate(paths) if path.exists()}
     if any(part.config != facts for part in parts.values()):

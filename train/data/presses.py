@@ -125,7 +125,7 @@ class PressSet:
         return digest.hexdigest()
 
     def save(self, path: Path) -> None:
-        """Write the presses as one npz, atomically; DatasetError if it cannot be written."""
+        """Write the presses as one npz, atomically."""
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["touching"] = np.packbits(self.touching, axis=-1)
         facts = json.dumps({"config": self.config, "sha256": self.sha256()})
@@ -134,12 +134,9 @@ class PressSet:
             with draft.open("wb") as file:
                 np.savez(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=facts, **arrays)
 
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            # Only the facts are read back: reading all arrays would need as much memory again.
-            write_in_place(path, write, lambda draft: read_npz(draft, ["facts"], _MOST_FACTS_BYTES), keep_before=False)
-        except OSError as error:
-            raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Only the facts are read back: reading all arrays would need as much memory again.
+        write_in_place(path, write, lambda draft: read_npz(draft, ["facts"], _MOST_FACTS_BYTES), keep_before=False)
 
 
 def load_presses(path: Path) -> PressSet:
