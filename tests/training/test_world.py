@@ -125,13 +125,8 @@ def test_ctrl_c_within_a_write_is_no_error_of_the_file(capsys):
 def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     path = tmp_path / "cut.npz"
     command = ["train.data.make_presses", str(path), "--families", "flat", "--count", "9000", "--per-pad", "1"]
-    run = subprocess.Popen(
-        [sys.executable, "-m", *command],
-        cwd=ROOT,
-        start_new_session=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    run = subprocess.Popen([sys.executable, "-m", *command], cwd=ROOT, start_new_session=True, **pipes)
     parts = path.with_name(path.name + ".parts")
     while len(list(parts.glob("*.npz"))) < 8:  # by then both workers have begun
         assert run.poll() is None, run.stderr.read().decode()
