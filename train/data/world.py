@@ -105,7 +105,7 @@ def solve_pad(world: World, number: int) -> PressSet:
     kept: list[PressSet] = []
     for _ in range(MOST_DRAWS):
         tapped = [draw_shape(rng, str(name), gripped, schedule(rng, world.taps)) for name in family]
-        made = press_shapes(rng, gripped, family, tapped, number, world.begun, world.scale)
+        made = press_shapes(rng, gripped, family, tapped, world.begun, world.scale)
         right = (made.force_n[:, 2] > LEAST_FORCE_N) & made.touching.any(axis=(1, 2))
         kept.append(made.pick(right))
         family = family[~right & np.char.startswith(family, MESH)]
@@ -120,11 +120,10 @@ def press_shapes(
     gripped: GrippedPad,
     family: NDArray[np.str_],
     tapped: list[Tapped],
-    number: int,
     begun: float = 0.0,
     scale: int = SCALE,
 ) -> PressSet:
-    """Press shapes onto pad `number` with drawn depths, drags and friction; light presses are kept.
+    """Press shapes onto a pad with drawn depths, drags and friction; light presses are kept.
 
     In a share `begun` of the sequences the newest tap is not as deep yet as the earlier ones were at their ends.
     """
@@ -150,7 +149,7 @@ def press_shapes(
     newest = {name: getattr(done, name)[::taps] for name in ("touching", "force_n", "twist_nmm", "indentation_mm")}
     return PressSet(
         family=family,
-        pad=np.full(n, number, dtype=np.int64),
+        pad=np.zeros(n, dtype=np.int64),
         constants=np.tile(constants(gripped.pad), (n, 1)),
         counts=done.counts.reshape(n, taps, *done.counts.shape[1:]),
         angle_deg=np.array([one.angle_deg for one in tapped], dtype=np.float32),

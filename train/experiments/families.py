@@ -194,7 +194,7 @@ def draw_shapes(count: int) -> list[tuple[str, Tapped]]:
 def _psnr_db(model: ModelSession, pad: Pad, shapes: list[tuple[str, Tapped]]) -> dict[str, NDArray[np.float64]]:
     """Return the PSNR of each shape on a pad, (n,), with nothing and all known of it."""
     rng, families = np.random.default_rng(SHAPES_SEED + 1), np.array([family for family, _ in shapes])
-    pressed = press_shapes(rng, GrippedPad(pad), families, [shape for _, shape in shapes], 0)
+    pressed = press_shapes(rng, GrippedPad(pad), families, [shape for _, shape in shapes])
     frozen = freeze_presses(pressed, SEED)
     return {
         name: psnr_db(infer_presses(model, frozen, known).patterns, frozen.patterns(), MAX_INDENTATION_MM)
