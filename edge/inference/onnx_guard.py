@@ -1,8 +1,7 @@
 """Guard of loading a model: its file is one plain graph with its own weights, of bounded size.
 
 onnxruntime follows a tensor into a side file, and a graph into graphs within it, which may run for ever. The walk
-covers the fields that lead to them and to the operators, skips all else, and refuses what it does not understand.
-Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
+covers the fields that lead to them and to the operators. Source: onnx.proto, IR version 10 to 13; Protocol Buffers.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,8 +24,7 @@ Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin ReduceSum ReduceSumSquare Rel
 Sigmoid Sign Sin Slice Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze Sub Sum Tanh Tile Transpose Unsqueeze
 Where
 """
-OPERATORS: Final = frozenset(_NAMES.split())
-"""Operators that are allowed, as docs/formats.md lists them: no loop, no recurrence, nothing random, no text."""
+OPERATORS: Final = frozenset(_NAMES.split())  # as docs/formats.md lists them: no loop, nothing random, no text
 _VARINT_BYTES: Final = 10
 _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 _FIXED_BYTES: Final = {_FIXED64: 8, _FIXED32: 4}
@@ -58,11 +56,7 @@ class _Field(NamedTuple):
 
 
 def read_model(path: Path) -> bytes:
-    """Return an ONNX file's content, for onnxruntime to load from memory.
-
-    Raises:
-        ModelError: the file is missing, too large, or not one plain graph with its weights.
-    """
+    """Return an ONNX file's content, for onnxruntime to load from memory, or raise a ModelError."""
     try:
         content = read_bounded(path, MOST_BYTES)
     except OSError as error:
@@ -75,12 +69,7 @@ def read_model(path: Path) -> bytes:
 
 
 def check_plain(content: bytes) -> None:
-    """Refuse all files but one plain graph with its weights.
-
-    Raises:
-        ModelError: weights in another file, or sparse; graphs within the graph; an operator that is not one of
-            OPERATORS, or too many; or not the encoding that ONNX has.
-    """
+    """Raise a ModelError for all files but one plain graph of OPERATORS with its weights."""
     waiting: list[tuple[_Message, int, int]] = [(_MODEL, 0, len(content))]
     fields = nodes = 0
     while waiting:
