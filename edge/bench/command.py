@@ -59,10 +59,7 @@ class BenchPage:
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
-    """Measure, show on `out` and write, with progress and warnings on `err`; returns the exit code.
-
-    Raises EdgeError where an input cannot be used or a measurement failed; those so far are written first.
-    """
+    """Measure, show on `out` and write; returns the exit code. Those so far are written before an EdgeError."""
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
     page, command = BenchPage(out, err), options.typed

@@ -24,6 +24,7 @@ from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.npz_recording import read_npz
 
+# Type and axes of each array; a letter stands for one length everywhere.
 _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "newest": ("int16", "n3rc"),
     "earlier": ("int16", "tk3rc"),
@@ -36,7 +37,6 @@ _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "angle_deg": ("f", "t"),
     "full_scale_mm": ("f", ""),
 }
-"""Type and axes of each array; a letter stands for one length everywhere."""
 
 
 class FrozenSetError(EdgeError, ValueError):
@@ -156,8 +156,7 @@ def judge(
 ) -> dict[str, NDArray[np.float64]]:
     """Return every metric of every frame, (n,) each, of patterns (n, H, W) in [mm].
 
-    A pixel counts as touched from `contact_level`, a share of its pattern's maximum. Without the half widths of the
-    90 % intervals, (n, H, W), "coverage_90" is left out.
+    A pixel counts as touched from `contact_level`, a share of its pattern's maximum; half widths are of 90 % intervals.
     """
     truth, full_scale = frozen.patterns(), frozen.full_scale_mm
     errors = {
@@ -174,7 +173,7 @@ def judge(
 
 
 def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> dict[str, NDArray[np.float64]]:
-    """Return every metric of every frame, (n,) each, of a model with the newest `given` taps or all that it takes."""
+    """Return every metric of every frame of a model with the newest `given` taps, or all that it takes."""
     patterns, half_width_mm = infer_with_intervals(model, frozen, given)
     return judge(patterns, frozen, model.contract.contact_level, half_width_mm, model.contract.pitch_mm)
 
@@ -182,10 +181,7 @@ def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> di
 def infer_with_intervals(
     model: Model, frozen: FrozenSet, given: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Return the patterns (n, H, W) of every frame, and the half widths of their 90 % intervals, both in [mm].
-
-    The intervals are None if the model gives no deviations.
-    """
+    """Return the patterns (n, H, W) of every frame, and the half widths of their 90 % intervals, None without."""
     contract = model.contract
     patterns: list[NDArray[np.float32]] = []
     half_widths_mm: list[NDArray[np.float32]] = []

@@ -23,13 +23,12 @@ from edge.perception.taxel_health import REPEATS, Health
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack
 
-MIN_TAP_SCANS: Final = 2
-"""Fewest scans of a tap. A touch in a single scan may be a flipped bit; it is reported, but not remembered as a tap."""
+MIN_TAP_SCANS: Final = 2  # a touch in a single scan may be a flipped bit: it is reported, but not remembered as a tap
 
 
 @dataclass(eq=False, slots=True)
 class TapPeak:
-    """Peak of a tap: the tap's number, when its readings (3, rows, cols) were taken, in [ns], and its pose if known."""
+    """Peak of a tap, when its readings (3, rows, cols) were taken, and its pose if known."""
 
     tap: int
     time_ns: int
@@ -38,33 +37,26 @@ class TapPeak:
 
 
 class TapTracker:
-    """Tracker of the taps of one sensor.
+    """Tracker of the taps of one sensor, for windows of K taps."""
 
-    Attributes:
-        contact: True while a tap goes on.
-        tap: number of the tap, from 0; without contact that of the last one.
-        newest: (3, rows, cols), newest readings in contact.
-        peaks: of the earlier taps, newest first: one fewer than a window has taps.
-    """
-
-    newest: NDArray[np.float32]
+    newest: NDArray[np.float32]  # readings (3, rows, cols) in contact
+    peaks: tuple[TapPeak, ...]  # of the earlier taps, newest first: one fewer than a window has taps
 
     def __init__(self, taps: int, options: RuntimeOptions) -> None:
-        """Start without contact, for windows of K taps."""
         self._earlier = taps - 1
         self._on_counts = options.contact_on_counts
         self._off_counts = options.contact_off_counts
         self._idle_reset_ns = options.idle_reset_s * 1e9
         self._peak: TapPeak | None = None
         self.contact = False
-        self.tap = -1
+        self.tap = -1  # number of the tap, from 0; without contact that of the last one
         self._last_contact_ns = 0
         self.reset()
 
     def reset(self) -> None:
         """Forget every tap. A tap in progress continues as the first one, with a new number."""
         self.tap += self.contact
-        self.peaks: tuple[TapPeak, ...] = ()
+        self.peaks = ()
         self._tap_scans = 0
         self._peak_counts = -math.inf
 
@@ -75,11 +67,10 @@ class TapTracker:
     def push(
         self, readings: NDArray[np.float32], z_counts: float, time_ns: int, taken_ns: int, *, doubted: bool = False
     ) -> None:
-        """Take the zeroed counts (3, rows, cols) of a scan with their summed z, when it arrived and was taken, in [ns].
+        """Take a scan's zeroed counts (3, rows, cols), their summed z, and when it arrived and was taken, in [ns].
 
-        The idle time is measured between scans, from the last one in contact. Time that runs backwards counts as no
-        time; a gap within a tap does not end the tap. A scan that is doubted, by `BaselineDoubt` of zeroing.py, is no
-        contact, whatever its z: this ends a tap where a pad rests.
+        The idle time counts from the last scan in contact; time that runs backwards counts as no time, and a gap within
+        a tap does not end it. A scan that is doubted is no contact, whatever its z: this ends a tap where a pad rests.
         """
         if self.contact:
             self.contact = z_counts >= self._off_counts and not doubted
@@ -112,9 +103,7 @@ class TapTracker:
             self.reset()
 
 
-_HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
-"""Four taps half a pitch apart read what lies between the taxels. A search for the place of the largest expected gain
-was worth 0.41 dB over such places at two taps and 0.08 dB at four, so it is not made."""
+_HALF_PITCH_MM: Final = USPA44.pitch_mm / 2  # four taps half a pitch apart read what lies between the taxels
 _SHIFTS_MM: Final = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]) * _HALF_PITCH_MM
 
 
@@ -216,10 +205,7 @@ class Taps:
     def _choose(
         self, tap: TapTracker, pose: PadPose | None, *, scheduled: bool
     ) -> tuple[Sequence[int], NDArray[np.float32]]:
-        """Return the taps to use during contact: places in the window, newest first, and their poses as model input.
-
-        The pose is that of the newest tap's pad at this scan; without poses taps follow the paper's schedule.
-        """
+        """Return the taps to use during contact: places in the window, newest first, and their poses as model input."""
         if scheduled:
             taps = min(1 + len(tap.peaks), self._scheduled)
             return range(taps), scheduled_rows(taps, self._contract.angle_step_deg)
