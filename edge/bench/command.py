@@ -71,12 +71,10 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         raise UsageError(f"{where}: cannot be made: {error.strerror}: name a folder to write in") from error
     frozen = load_frozen_set(FROZEN_FILE)
     everyone = chosen(subjects(frozen.scale, options.models, page.warn), options.only)
-    # With fewer p99.9 rests on the longest few.
-    few = "" if options.ticks >= 3000 else " (fewer than 3000: p99.9 and misses mean little)"
     date = datetime.now(UTC).isoformat(timespec="seconds")
     page.say(
         f"# Error against run time\n\n{date}, `{command}`\n\n{this_machine()}. {options.ticks} ticks a row at "
-        f"{RATE_HZ:g} Hz{few}, on one thread, as the program runs."
+        f"{RATE_HZ:g} Hz, on one thread, as the program runs."
     )
     lines: list[dict[str, Any]] = []
     try:

@@ -31,7 +31,7 @@ _BLOCK: Final = re.compile(r"^```toml\n(command = .*?)^```\n", re.DOTALL | re.MU
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Provenance of a report: how it was made, and the hash, or UNKNOWN, of each model or set and each source."""
+    """Provenance of a report: how it was made, and the hash of each model or set and each source."""
 
     command: str
     date: str
@@ -57,8 +57,6 @@ class Provenance:
         for name, before in {**self.models, **self.sources}.items():
             if not (ROOT / name).exists():
                 yield f"{name} is not here"
-            elif before == UNKNOWN:
-                yield f"of {name} no hash was kept"
             elif file_hash(ROOT / name) != before:
                 yield f"{name} has changed"
 

@@ -115,7 +115,10 @@ def load_frozen_set(path: Path) -> FrozenSet:
     """Load a frozen test set; raises FrozenSetError, which names what is missing, or of another type or shape."""
     try:
         arrays = read_npz(path, _AXES, 1 << 31)
-        _check_axes(arrays)
+        lengths = check_axes(_AXES, arrays)
+        taps = arrays["tap"]
+        if not taps.size or taps.min() < 0 or taps.max() >= lengths["t"] or not 0 < arrays["full_scale_mm"] < np.inf:
+            raise ValueError("array 'tap' names taps that are not there, or 'full_scale_mm' is not a length")
     except (OSError, ValueError) as error:
         raise FrozenSetError(
             f"{path} is not a frozen test set ({error}): make it with 'python -m train.freeze'"
@@ -138,13 +141,6 @@ def check_axes(axes_of: Mapping[str, tuple[str, str]], arrays: Mapping[str, NDAr
             expected = ", ".join(str(lengths.get(axis, axis)) for axis in axes)
             raise ValueError(f"array '{name}' is {array.dtype} {array.shape}, expected {kind} ({expected})")
     return lengths
-
-
-def _check_axes(arrays: Mapping[str, NDArray[Any]]) -> None:
-    lengths = check_axes(_AXES, arrays)
-    taps = arrays["tap"]
-    if not taps.size or taps.min() < 0 or taps.max() >= lengths["t"] or not 0 < arrays["full_scale_mm"] < np.inf:
-        raise ValueError("array 'tap' names taps that are not there, or 'full_scale_mm' is not a length")
 
 
 def judge(
