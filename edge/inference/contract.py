@@ -143,13 +143,8 @@ class Contract:
 
     def check_sensor(self, geometry: SensorGeometry) -> None:
         """Raise a ModelError, which names the key, for a sensor that the model was not trained for."""
-        for key, got in (
-            ("sensor", geometry.name),
-            ("rows", geometry.rows),
-            ("cols", geometry.cols),
-            ("pitch_mm", geometry.pitch_mm),
-        ):
-            expected = getattr(self, key)
+        for key, name in (("sensor", "name"), ("rows", "rows"), ("cols", "cols"), ("pitch_mm", "pitch_mm")):
+            expected, got = getattr(self, key), getattr(geometry, name)
             if got != expected:
                 raise ModelError(
                     f"contract key '{key}' is {expected!r}, but the sensor's is {got!r}: the model is for a "

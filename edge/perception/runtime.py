@@ -18,7 +18,7 @@ from edge.perception.gain_learning import ContactModel, Learn
 from edge.perception.pattern_description import Describe
 from edge.perception.result import Estimate, LastPattern, Result, Step, Window
 from edge.perception.taps import Taps, TapTracker
-from edge.perception.taxel_health import Health, TaxelEstimator
+from edge.perception.taxel_health import Health
 from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.perception.zeroing import BaselineDoubt, Zeroing
 from edge.validation import check_baselines, check_counts_per_newton, check_kind, check_mountings, check_pads
@@ -178,7 +178,7 @@ class Runtime:
     model: Model
     _: KW_ONLY
     source: SourceKind
-    estimator: TaxelEstimator | None = None  # without it there is no pattern while a taxel is dead
+    estimator: NDArray[np.float64] | None = None  # of dead taxels; without it they allow no pattern
     contacts: ContactModel | None = None  # by which gains are learned, if the options ask for that
     geometry: SensorGeometry = USPA44
     baselines: Mapping[str, Baseline] = field(default_factory=dict)

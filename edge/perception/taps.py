@@ -155,7 +155,6 @@ class Taps:
         self._radius_mm = contract.pitch_mm * sqrt((contract.rows**2 + contract.cols**2 - 2) / 12)
         self._reported: deque[int] = deque(maxlen=64)  # newest taps that were left out; no window has as many
         self._strongest: tuple[int, float, PadPose | None] = -1, 0.0, None  # pattern: its tap, its summed z, its pose
-        self._proposed: tuple[tuple[TapPeak, ...], NextTap | None] = (), None  # for which taps, and what
 
     def __call__(self, step: Step, track: PoseTrack | None) -> None:
         """Take a step with readings; `track` has the poses of its pad, None if there are none."""
@@ -236,16 +235,11 @@ class Taps:
             self._report(kind, why)
 
     def _propose(self, peaks: tuple[TapPeak, ...]) -> NextTap | None:
-        """Return where to touch next, the same for the same taps; None where no tap is to follow the newest."""
+        """Return where to touch next; None where no tap is to follow the newest."""
         tap, _, newest = self._strongest
         if newest is None or tap != peaks[0].tap:
             return None
-        if peaks is not self._proposed[0]:
-            seen = [
-                newest.seen_from(newest),
-                *(one.pose.seen_from(newest) for one in peaks[1:] if one.pose is not None),
-            ]
-            shift_mm = next_shift_mm(np.array([(pose.x_mm, pose.y_mm) for pose in seen]), self._contract.reach_mm)
-            proposed = None if shift_mm is None else NextTap(*shift_mm, 0.0, _reached(newest, *shift_mm))
-            self._proposed = peaks, proposed
-        return self._proposed[1]
+        poses = [newest, *(peak.pose for peak in peaks[1:] if peak.pose is not None)]
+        seen = [pose.seen_from(newest) for pose in poses]
+        shift_mm = next_shift_mm(np.array([(pose.x_mm, pose.y_mm) for pose in seen]), self._contract.reach_mm)
+        return None if shift_mm is None else NextTap(*shift_mm, 0.0, _reached(newest, *shift_mm))

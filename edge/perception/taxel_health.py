@@ -54,6 +54,9 @@ _OVERLOADED: Final = ": overloaded, too near a magnet, or broken"
 WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
 
 
+Fill = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+
+
 class Health:
     """Stage: the newest reading of each taxel over the baseline, which taxels are dead, and estimates of those.
 
@@ -66,11 +69,11 @@ class Health:
         self,
         grid_shape: tuple[int, int],
         mounting: Mounting | None = None,
-        estimator: "TaxelEstimator | None" = None,
+        estimator: NDArray[np.float64] | None = None,
     ) -> None:
         """Start with no reading of a grid (rows, cols); without an estimator dead taxels allow no pattern."""
         self._mounting, self._estimator = mounting, estimator
-        self._fill: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None
+        self._fill: Fill | None = None
         self.held: NDArray[np.int32] = np.zeros((3, *grid_shape), dtype=np.int32)  # newest reading of each taxel
         # The dead are another array only where they are others than before.
         self.dead, self._arrived, self._saturated, self._unzeroed = np.zeros((4, *grid_shape), dtype=bool)
@@ -127,7 +130,7 @@ class Health:
         if self.dead is dead:
             return False
         possible = 0 < 2 * np.count_nonzero(self.dead) <= dead.size
-        self._fill = self._estimator.filler(self.dead) if self._estimator is not None and possible else None
+        self._fill = filler(self._estimator, self.dead) if self._estimator is not None and possible else None
         return True
 
     def fill(self, step: Step) -> None:
@@ -255,36 +258,25 @@ def _named(taxels: list[int] | NDArray[np.integer]) -> str:
     return f"taxel {', '.join(map(str, taxels))}"
 
 
-class TaxelEstimator:
-    """Estimator of dead taxels, by covariances (kinds, 3 taxels, 3 taxels) of the zeroed counts of simulated presses.
+def filler(covariances: NDArray[np.float64], dead: NDArray[np.bool_]) -> Fill:
+    """Return what puts estimates in the place of dead taxels (rows, cols), not all, into scans of zeroed counts.
 
     Readings are modelled as drawn from one of several kinds of contact, each a zero-mean Gaussian of any scale. The
-    living taxels give the probability of each kind, and each kind an estimate. Raises EdgeError for another grid.
+    living taxels give the probability of each kind, and each kind, by its covariances of all channels, an estimate.
     """
+    off = np.tile(dead.ravel(), len(AXES))
+    lost, live = np.flatnonzero(off), np.flatnonzero(~off)
+    living = covariances[:, live[:, None], live]
+    kinds = Kinds(living)
+    maps = np.linalg.solve(living, covariances[:, live[:, None], lost]).transpose(0, 2, 1)
 
-    def __init__(self, covariances: NDArray[np.floating], grid_shape: tuple[int, int]) -> None:
-        channels = len(AXES) * grid_shape[0] * grid_shape[1]
-        if covariances.shape[1:] != (channels, channels):
-            raise EdgeError(
-                f"covariances are {covariances.shape}, expected (n, {channels}, {channels}): freeze them again"
-            )
-        self._covariances = ridged(covariances.astype(np.float64))
+    def fill(zeroed: NDArray[np.float32]) -> NDArray[np.float32]:
+        readings = zeroed.ravel()[live].astype(np.float64)
+        counts = zeroed.copy()
+        counts.flat[lost] = kinds.weigh(readings[None])[0] @ (maps @ readings)
+        return counts
 
-    def filler(self, dead: NDArray[np.bool_]) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
-        """Return what puts estimates in the place of dead taxels (rows, cols), not all, into scans of zeroed counts."""
-        off = np.tile(dead.ravel(), len(AXES))
-        lost, live = np.flatnonzero(off), np.flatnonzero(~off)
-        living = self._covariances[:, live[:, None], live]
-        kinds = Kinds(living)
-        maps = np.linalg.solve(living, self._covariances[:, live[:, None], lost]).transpose(0, 2, 1)
-
-        def fill(zeroed: NDArray[np.float32]) -> NDArray[np.float32]:
-            readings = zeroed.ravel()[live].astype(np.float64)
-            counts = zeroed.copy()
-            counts.flat[lost] = kinds.weigh(readings[None])[0] @ (maps @ readings)
-            return counts
-
-        return fill
+    return fill
 
 
 class Kinds:
@@ -312,10 +304,13 @@ def ridged(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     return covariances + ridges[:, None, None] * np.eye(covariances.shape[1])
 
 
-def load_estimator(path: Path, grid_shape: tuple[int, int]) -> TaxelEstimator:
-    """Load the covariances that `train.freeze` has made, or raise an EdgeError."""
+def load_estimator(path: Path, grid_shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Load the covariances (kinds, 3 taxels, 3 taxels) that `train.freeze` has made, or raise an EdgeError."""
+    channels = len(AXES) * grid_shape[0] * grid_shape[1]
     try:
         covariances = read_npz(path, ["covariances"], 1 << 24)["covariances"]
+        if covariances.shape[1:] != (channels, channels):
+            raise ValueError(f"covariances are {covariances.shape}, expected (n, {channels}, {channels})")
     except (OSError, ValueError, KeyError) as error:
         raise EdgeError(f"{path} cannot be read ({error}): make it with 'python -m train.freeze'") from error
-    return TaxelEstimator(covariances, grid_shape)
+    return ridged(covariances.astype(np.float64))

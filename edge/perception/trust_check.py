@@ -8,7 +8,6 @@ those of strange readings and of earlier taps travel in the model, from `train.t
 
 import math
 import sys
-from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -131,7 +130,9 @@ class PatternCheck:
         have begun. `scaled` is the window in network units.
         """
         belonging = tuple(self.belonging(scaled, window.taps, window.poses))
-        dropped = foreign_taps(belonging, posed=posed)
+        dropped = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
+        if dropped and not posed:  # the taps before it go, too: their turns are counted over it
+            dropped = list(range(dropped[0], window.taps))
         forgotten = [
             number
             for number in (dropped if posed else dropped[:1])
@@ -201,15 +202,6 @@ class PatternCheck:
                 self.suspected = suspected
                 self._report("suspected" if suspected else "cleared", SUSPECTED if suspected else "")
         self._tap, self._strongest = tap, -math.inf
-
-
-def foreign_taps(belonging: Sequence[float], *, posed: bool) -> list[int]:
-    """Return the numbers, from 1, of the earlier taps that a pattern is made without, by `PatternCheck.belonging`.
-
-    A tap with a pose of its own goes alone. Without poses the taps before it go, too: their turns are counted over it.
-    """
-    foreign = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
-    return foreign if posed or not foreign else list(range(foreign[0], len(belonging) + 1))
 
 
 def _alternates(z: NDArray[np.float32]) -> bool:

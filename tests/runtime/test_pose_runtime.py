@@ -250,7 +250,7 @@ def test_it_stays_until_the_next_tap_or_an_idle_time():
     pad = make_pad(SURE, idle_reset_s=0.2)
     pad.tap(PadPose(0, 0))
     proposed = pad.results[-1].next_tap
-    assert pad.push().next_tap is proposed is not None
+    assert pad.push().next_tap == proposed is not None
     assert pad.push(PRESS).next_tap is None
     pad.tap(PadPose(1, 0))
     assert pad.push().next_tap is not None

@@ -19,7 +19,6 @@ from edge.perception.trust_check import (
     PatternCheck,
     SensorPad,
     TrustVerdict,
-    foreign_taps,
 )
 from firmware_bridge.scans.pad_constants import GAINS
 
@@ -185,13 +184,6 @@ class TestBelonging:
         assert check.belonging(window, 4) == [], "a model that takes no poses has no such check"
         window[1, 0, 0, 0] = np.nan
         assert check.belonging(window, 4, poses)[0] >= 0.5
-
-    @pytest.mark.parametrize(
-        ("shares", "alone", "with_those_before"),
-        [([0.1, 0.9, 0.2], [2], [2, 3]), ([], [], []), ([0.1, 0.49], [], []), ([0.5], [1], [1])],
-    )
-    def test_a_tap_with_a_pose_of_its_own_goes_alone(self, shares, alone, with_those_before):
-        assert foreign_taps(shares, posed=True) == alone and foreign_taps(shares, posed=False) == with_those_before
 
 
 EVERY = RuntimeOptions(every_scan=True, follow_drift=False)
