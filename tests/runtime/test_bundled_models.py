@@ -140,12 +140,10 @@ class TestSet:
         assert (windows[4, 0] == small.newest[4]).all() and (windows[4, 2] == small.earlier[1, 1]).all()
         given_two = small.windows(4, given=2)
         assert (given_two[:, :2] == windows[:, :2]).all() and not given_two[:, 2:].any()
-        assert small.windows(1).shape == (6, 1, 3, 4, 4)
         for taps in (0, 8):
             with pytest.raises(FrozenSetError, match=f"windows of {taps} taps asked for, the frozen test set has"):
                 small.windows(taps)
-
-    def test_truth_is_the_unit_pattern_times_the_indentation(self, small):
+        # The truth is the unit pattern times the indentation.
         assert np.allclose(small.patterns()[5], 0.5 * 0.6)
         assert np.allclose(small.patterns()[1].diagonal(), small.indentation_mm[1])
         assert small.touching()[0].sum() == 40 and not small.touching()[5].any() and small.scale == 10
@@ -163,39 +161,22 @@ class TestSet:
         np.savez(path, newest=small.newest)
         with pytest.raises(FrozenSetError, match="earlier"):
             load_frozen_set(path)
-
-    def test_the_bundled_one_is_the_one_that_is_frozen(self):
-        frozen = load_frozen_set(bundled.BUNDLE_DIR / "frozen.npz")
-        assert len(frozen) == 1152 and len(set(frozen.surface.tolist())) == 18
-        assert float(frozen.patterns().max()) <= frozen.full_scale_mm
+        assert len(frozen()) == 1152 and len(set(frozen().surface.tolist())) == 18, "the bundled one"
 
 
-@pytest.fixture
-def models(bundle, tmp_path, monkeypatch):
+def test_a_name_is_that_of_the_best_file_there_is(bundle, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("mtsr4", "stsr"):
+    for name in ("mtsr4", "mtsr4-int8", "stsr"):
         write_model(bundle / f"{name}.onnx")
-    return bundle
-
-
-class TestBundle:
-    @pytest.mark.parametrize("name", ["mtsr4", "mtsr4.onnx", "{models}/mtsr4.onnx", "{models}/mtsr4"])
-    def test_a_name_without_precision_is_the_best_file_there_is(self, models, name):
-        write_model(models / "mtsr4-int8.onnx")
-        asked = name.format(models=models)
-        assert bundled.find_model(asked) == models / "mtsr4.onnx"
-        (models / "mtsr4.onnx").unlink()
-        assert bundled.find_model(asked) == models / "mtsr4-int8.onnx"
-        assert [path.stem for path in bundled.bundled_models()] == ["mtsr4-int8", "stsr"]
-
-    def test_a_file_wins_over_a_bundled_name_and_no_directory_does(self, models, tmp_path):
-        (tmp_path / "mtsr4").mkdir()
-        (tmp_path / "stsr").write_text("mine")
-        assert bundled.find_model("mtsr4") == models / "mtsr4.onnx" and bundled.find_model("stsr").read_text() == "mine"
-
-    def test_what_is_missing_is_told(self, models):
-        for name in ("mtsr9", "mtsr4.onn", "", "none/mtsr4.onnx"):
-            with pytest.raises(ModelError, match=r"no model.*bundled: mtsr4.onnx, stsr.onnx"):
-                bundled.find_model(name)
-        with pytest.raises(UsageError, match=r"demo.npz is missing"):
-            bundled.demo_recording()
+    (tmp_path / "mtsr4").mkdir()  # no directory is a model
+    for best in ("mtsr4.onnx", "mtsr4-int8.onnx"):
+        for asked in ("mtsr4", "mtsr4.onnx", f"{bundle}/mtsr4.onnx", f"{bundle}/mtsr4"):
+            assert bundled.find_model(asked) == bundle / best
+        (bundle / best).unlink()
+    for name in ("mtsr9", "mtsr4.onn", "", "none/stsr.onnx"):
+        with pytest.raises(ModelError, match=r"no model.*bundled: stsr.onnx\)"):
+            bundled.find_model(name)
+    (tmp_path / "stsr").write_text("mine")
+    assert bundled.find_model("stsr").read_text() == "mine", "a file wins over a bundled name"
+    with pytest.raises(UsageError, match=r"demo.npz is missing"):
+        bundled.demo_recording()
