@@ -4,7 +4,7 @@ import json
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import prod
@@ -81,14 +81,7 @@ def make_wrench_result(number: int = 0, press_counts: float = 20_000, **settings
     return runtime.push(make_scan(number, press_counts=press_counts, time_ns=time.monotonic_ns()))
 
 
-def write_model(
-    path: Path,
-    contract: Contract | None = None,
-    *,
-    metadata: dict[str, str] | None = None,
-    doubt: float = TINY_DOUBT,
-    gain: float = 1.0,
-) -> Path:
+def write_model(path: Path, contract: Contract | None = None, *, metadata=None, doubt=TINY_DOUBT, gain=1.0) -> Path:
     """Write a real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
 
     The deviation, there if the contract has a factor for it, is `tiny_deviation`. A pad, likewise, makes all stronger
@@ -174,17 +167,7 @@ def tiny_deviation(pattern: np.ndarray) -> np.ndarray:
     return TINY_DOUBT * (1 + np.abs(pattern))
 
 
-def make_scan(
-    number: int = 0,
-    *,
-    press_counts: float = 0.0,
-    taxel: int = 5,
-    sensor: str = "4",
-    absent: tuple[int, ...] = (),
-    stale: tuple[int, ...] = (),
-    time_ns: int | None = None,
-    noise: int = 0,
-) -> Scan:
+def make_scan(number=0, *, press_counts=0.0, taxel=5, sensor="4", absent=(), stale=(), time_ns=None, noise=0) -> Scan:
     """Return a scan with one taxel pressed; `absent` taxels gave no reading, `stale` ones are not renewed."""
     counts = REST.copy()
     counts[2].flat[taxel] += int(press_counts)
@@ -246,12 +229,7 @@ class FakeModel:
             self.traction = tiny_traction(window, self.contract.traction_scale).astype(np.float32) * stiffness
         return pattern
 
-    def run_together(
-        self,
-        windows: Sequence[np.ndarray],
-        pads: Sequence[np.ndarray] | None = None,
-        poses: Sequence[np.ndarray] | None = None,
-    ) -> np.ndarray:
+    def run_together(self, windows, pads=None, poses=None) -> np.ndarray:
         made = []
         for index, window in enumerate(windows):
             pad, rows = (None if more is None else more[index] for more in (pads, poses))
@@ -276,25 +254,13 @@ class FakeLink(Link):
     """
 
     def __init__(
-        self,
-        batches,
-        *,
-        error: Exception | None = None,
-        kind: SourceKind = "device",
-        endless: bool = False,
-        prefix: str = "",
-        lasts: bool = False,
+        self, batches, *, error=None, kind: SourceKind = "device", endless=False, prefix="", lasts=False
     ) -> None:
-        self.name = "fake"
-        self.prefix, self.lasts = prefix, lasts
+        self.name, self.prefix, self.lasts = "fake", prefix, lasts
         self.kind: SourceKind = kind
-        self.ended = False
-        self.reads = 0
-        self.through = threading.Event()
-        self._batches = list(batches)
-        self._error = error
-        self._endless = endless
-        self._given = 0
+        self.ended, self.through = False, threading.Event()
+        self.reads = self._given = 0
+        self._batches, self._error, self._endless = list(batches), error, endless
 
     def __enter__(self):
         return self
@@ -346,12 +312,8 @@ class ListSink(Sink):
     """Sink that keeps the results it gets."""
 
     def __init__(self, on_write=lambda result: None) -> None:
-        self.results = []
-        self.counters = []
-        self.events = []
-        self.told_counters = []
-        self.waits = 0
-        self.closed = False
+        self.results, self.counters, self.events, self.told_counters = [], [], [], []
+        self.waits, self.closed = 0, False
         self._on_write = on_write
 
     def write(self, result, counters) -> None:
