@@ -10,9 +10,7 @@ from pose_samples import make_posed_contract
 from trust_samples import make_checked_contract, make_posed_trust, make_trusted_contract
 
 from edge.api import USPA44, ModelError, Pad
-from edge.inference.bundled import find_model
 from edge.inference.contract import CONTRACT_VERSION, Contract
-from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad_constants import PAD_RANGES
 
 BROKEN_VALUES = {
@@ -94,13 +92,12 @@ def test_a_key_that_is_missing_or_broken_is_named(key):
             Contract.from_metadata(metadata)
 
 
-@pytest.mark.parametrize("version", [1, CONTRACT_VERSION - 1, CONTRACT_VERSION + 1])
+@pytest.mark.parametrize("version", [CONTRACT_VERSION - 1, CONTRACT_VERSION + 1])
 def test_another_version_is_named_not_what_it_lacks(version):
     metadata = make_contract(version=version).to_metadata()
     del metadata["tactile.interval_factor"]
-    with pytest.raises(
-        ModelError, match=f"'version' is {version}, expected {CONTRACT_VERSION}: export the model again"
-    ):
+    expected = f"'version' is {version}, expected {CONTRACT_VERSION}: export the model again"
+    with pytest.raises(ModelError, match=expected):
         Contract.from_metadata(metadata)
 
 
@@ -108,13 +105,9 @@ def test_another_version_is_named_not_what_it_lacks(version):
     ("key", "text", "match"),
     [
         ("pad_inputs", '[["thickness_mm", "4", 1]]', "a list of"),
-        ("pad_inputs", '[["thickness", 1, 1]]', "a list of"),
-        ("pad_inputs", "[[7, 1, 1]]", "a list of"),
         ("pad_inputs", "[4]", r"a list of \[name, centre, spread\]"),
         ("pad_inputs", '[[["thickness_mm"], 1, 1]]', "names of: thickness_mm, shear_modulus_mpa, poisson, in_plane"),
-        ("pad_inputs", '[["thickness_mm", 4]]', "a list of"),
         ("pad_inputs", '[["thickness_mm", -4, 1]]', "centre as a pad may have it"),
-        ("pad_inputs", '[["thickness_mm", 4, true]]', "a list of"),
         ("pad_inputs", '[["poisson", 0.4, 0.1], ["poisson", 0.4, 0.1]]', "no name twice"),
         ("traction_scale", "0", "a whole number from 1 to 256, or null"),
         ("traction_scale", "true", "a whole number"),
@@ -122,8 +115,8 @@ def test_another_version_is_named_not_what_it_lacks(version):
         *(
             ("made_for", text, "a map to two numbers, of names of: thickness_mm, .*, gains_certainty")
             for text in (
-                *('{"colour": [0, 1]}', '{"poisson": [0.4]}', '{"poisson": [0.4, 0.45, 0.5]}'),
-                *('{"poisson": ["0.4", 0.5]}', '{"poisson": "0.4"}', "[]", '{"poisson": {"0": 0, "1": 1}}'),
+                *('{"colour": [0, 1]}', '{"poisson": [0.4]}'),
+                *('{"poisson": ["0.4", 0.5]}', "[]", '{"poisson": 1}'),
             )
         ),
         ("tap_order", f'"{"x" * 98}"', "x', expected"),  # a hundred characters of it are shown
@@ -166,27 +159,19 @@ def test_a_contract_is_taken_up_to_its_limits(lawful, one_more, match):
         read(make_contract(), **lawful | one_more)
 
 
-def test_a_model_takes_no_gains_and_no_poses_unless_it_says_so():
-    contract = make_contract()
-    assert not contract.takes_gains and not contract.takes_poses and contract.pad_width == 0
-    assert len(replace(contract, takes_gains=True).pad_row(Pad(gains=(1.0,) * 48))) == 1
-
-
-@pytest.mark.parametrize("change", [{"name": "other"}, {"rows": 5}, {"cols": 5}, {"pitch_mm": 4.8}])
-def test_a_sensor_that_the_model_was_not_trained_for_is_refused(change):
+def test_a_sensor_that_the_model_was_not_trained_for_is_refused():
     make_contract().check_sensor(USPA44)
-    with pytest.raises(ModelError, match=f"contract key '{next(iter(change)).replace('name', 'sensor')}' is"):
-        make_contract().check_sensor(replace(USPA44, **change))
+    for key, name, value in (("sensor", "name", "other"), *((key, key, 5) for key in ("rows", "cols", "pitch_mm"))):
+        with pytest.raises(ModelError, match=f"contract key '{key}' is"):
+            make_contract().check_sensor(replace(USPA44, **{name: value}))
 
 
 @pytest.mark.parametrize(
     ("pad", "outside"),
     [
         (None, False),
-        (Pad(), False),
         (Pad(thickness_mm=5.25), False),
         (Pad(thickness_mm=5.3), True),
-        (Pad(thickness_mm=3.75), False),
         (Pad(thickness_mm=3.7), True),
         (Pad(thickness_mm=5.3, intervals={"thickness_mm": (5.0, 5.6)}), False),
         (Pad(thickness_mm=7.0, intervals={"thickness_mm": (5.5, 8.5)}), True),
@@ -204,7 +189,6 @@ def test_a_pad_far_outside_the_training_is_told(pad, outside):
         (None, True),
         (Pad(), True),
         (Pad(thickness_mm=4.9), False),
-        (Pad(thickness_mm=5.1), False),
         (Pad(thickness_mm=4.89), True),
         (Pad(thickness_mm=5.11), True),
         (Pad(thickness_mm=5.2, intervals={"thickness_mm": (5.1, 5.3)}), False),
@@ -216,11 +200,6 @@ def test_any_other_pad_is_outside_for_a_model_of_one_sensor(pad, outside):
     gains = {"gains": (1.0,) * 48, "gain_half_widths": (0.0,) * 48}
     of_gains = make_contract(made_for={"gains_certainty": [0.5, 1.0]})
     assert of_gains.is_outside(pad) and not of_gains.is_outside(Pad(**gains))
-
-
-def test_a_bundled_model_has_this_contract():
-    contract = ModelSession(find_model("stsr-int8")).contract
-    assert not contract.takes_poses and contract.made_for == {} and not contract.is_outside(None)
 
 
 @pytest.mark.parametrize(
