@@ -85,7 +85,7 @@ def fit_gain(interpolated: NDArray[np.floating], truth: NDArray[np.floating]) ->
 def fit_linear_map(
     readings: NDArray[np.floating], patterns: NDArray[np.floating], ridge: float = 1e-4
 ) -> NDArray[np.float32]:
-    """Return the least-squares matrix (features, pixels) with readings (n, features) @ matrix ~ patterns (n, pixels).
+    """Return the matrix of least squares with readings (n, features) @ matrix ~ patterns (n, pixels).
 
     The ridge is the weight of the penalty on the matrix, as a share of the mean feature energy.
     """

@@ -71,10 +71,7 @@ class FrozenSet:
         return self.unit_patterns.shape[-1] // self.newest.shape[-1]
 
     def windows(self, taps: int, given: int | None = None) -> NDArray[np.float32]:
-        """Return windows (n, taps, 3, rows, cols) in zeroed counts, the newest `given` taps as read, the rest zero.
-
-        Raises FrozenSetError if the set has fewer taps.
-        """
+        """Return windows (n, taps, 3, rows, cols) in zeroed counts, the newest `given` taps as read, the rest zero."""
         if not 1 <= taps <= 1 + self.earlier.shape[1]:
             raise FrozenSetError(
                 f"windows of {taps} taps asked for, the frozen test set has {1 + self.earlier.shape[1]}: make it again "
@@ -150,10 +147,7 @@ def judge(
     half_width_mm: NDArray[np.floating] | None = None,
     pitch_mm: float = USPA44.pitch_mm,
 ) -> dict[str, NDArray[np.float64]]:
-    """Return every metric of every frame, (n,) each, of patterns (n, H, W) in [mm].
-
-    A pixel counts as touched from `contact_level`, a share of its pattern's maximum; half widths are of 90 % intervals.
-    """
+    """Return every metric of every frame, (n,) each, of patterns and half widths of 90 % intervals (n, H, W)."""
     truth, full_scale = frozen.patterns(), frozen.full_scale_mm
     errors = {
         "psnr_db": psnr_db(patterns, truth, full_scale),

@@ -184,10 +184,7 @@ class Contract:
         return row
 
     def is_outside(self, pad: Pad | None) -> bool:
-        """Return whether a constant that the model takes, or its whole interval, is far outside the training.
-
-        Of a model for one sensor any other pad is outside.
-        """
+        """Return whether a constant that the model takes, or its whole interval, is far outside the training."""
         constants = {} if pad is None else pad.constants | {GAINS_CERTAINTY: pad.gains_certainty}
         for name, (least, most) in self.made_for.items():
             low, high = (constants.get(name, math.nan),) * 2

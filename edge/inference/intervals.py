@@ -38,10 +38,7 @@ def half_widths_mm(
     deviations: NDArray[np.floating],
     region: NDArray[np.integer],
 ) -> NDArray[np.floating]:
-    """Return half widths (n, H, W) in [mm] of the intervals that hold so many percent of the pixels in each region.
-
-    `levels` are the contract's `interval_levels`, of which `percent` is a key; deviations are (n, H, W) in [mm].
-    """
+    """Return half widths (n, H, W) of the intervals of so many percent, a key of the contract's `interval_levels`."""
     return deviations * np.asarray(levels[percent], dtype=np.float32)[region]
 
 

@@ -88,16 +88,12 @@ def check_plain(content: bytes) -> None:
                 waiting.append((kind, field.start, field.end))
             if message is _TENSOR and field.number == _LOCATION and (field.wire != _VARINT or field.value):
                 raise ModelError(_SIDE_FILE)
-            if message is _NODE and field.number in (_OPERATOR, _DOMAIN):
-                _check_operator(field.number, content[field.start : field.end])
-
-
-def _check_operator(field: int, name: bytes) -> None:
-    text = name[:40].decode(errors="replace")
-    if field == _OPERATOR and text not in OPERATORS:
-        raise ModelError(f"has operator {text!r}, expected only those that docs/formats.md lists")
-    if field == _DOMAIN and text not in ("", "ai.onnx"):
-        raise ModelError(f"has an operator of domain {text!r}, expected ONNX's own alone")
+            if message is _NODE:
+                text = content[field.start : field.end][:40].decode(errors="replace")
+                if field.number == _OPERATOR and text not in OPERATORS:
+                    raise ModelError(f"has operator {text!r}, expected only those that docs/formats.md lists")
+                if field.number == _DOMAIN and text not in ("", "ai.onnx"):
+                    raise ModelError(f"has an operator of domain {text!r}, expected ONNX's own alone")
 
 
 def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:

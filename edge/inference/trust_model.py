@@ -110,8 +110,7 @@ class ForwardModel:
     ) -> float:
         """Return the share of the energy of a tap's readings that its pattern leaves unexplained.
 
-        Readings (3, rows, cols) count less where noise, drift, the operator of the pad, and the standard deviation that
-        remains of the gains make them uncertain.
+        Readings count less where noise, drift, the operator, and what remains of the gains make them uncertain.
         """
         readings, z = tap.reshape(-1), tap[2].reshape(-1)
         energy = readings * readings

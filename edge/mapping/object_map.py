@@ -47,17 +47,13 @@ class Footprint(NamedTuple):
         col = np.minimum(cols.astype(np.intp), width - 2)
         down, right = (rows - row).astype(np.float32)[:, None], (cols - col).astype(np.float32)[:, None]
         flat, corner = layers.reshape(-1, depth), row * width + col
-        upper = _between(flat, corner, right)
-        lower = _between(flat, corner + width, right)
-        lower -= upper
-        lower *= down
-        lower += upper
-        return lower
+        upper, lower = (
+            _between(flat.take(left, axis=0), flat.take(left + 1, axis=0), right) for left in (corner, corner + width)
+        )
+        return _between(upper, lower, down)
 
 
-def _between(flat: NDArray[np.float32], left: NDArray[np.intp], share: NDArray[np.float32]) -> NDArray[np.float32]:
-    here = flat.take(left, axis=0)
-    there = flat.take(left + 1, axis=0)
+def _between(here: NDArray[np.float32], there: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray[np.float32]:
     there -= here
     there *= share
     there += here

@@ -97,17 +97,11 @@ def age_notes(scan: Scan) -> tuple[Note, ...]:
 UNCHECKED: Final = Note("not_checked", "not checked: the model has no checks")
 
 
-def waited_note(waited_ns: int) -> Note:
-    """Return the note on a pattern that was ready more than OLD_NS after its newest reading arrived, in [ns]."""
-    return Note("late", f"this pattern was ready {waited_ns / 1e9:.2f} s after its newest reading arrived")
-
-
 def notes_on_missing(sensor: str, mounted: Collection[str], zeroed: Collection[str]) -> tuple[Note, ...]:
     """Return notes on what is stored for other sensors, `mounted` or `zeroed`, but not for this one."""
     notes: list[Note] = []
     if mounted and sensor not in mounted:
-        others = ", ".join(sorted(mounted))
-        text = f"the sensor file has no sensor {sensor}, only {others}: taken as wired"
+        text = f"the sensor file has no sensor {sensor}, only {', '.join(sorted(mounted))}: taken as wired"
         notes.append(Note("not_in_sensor_file", text))
     if zeroed and sensor not in zeroed:
         text = f"no stored baseline for sensor {sensor}, only for {', '.join(sorted(zeroed))}: zeroing"

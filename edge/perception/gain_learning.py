@@ -296,7 +296,6 @@ class Learn:
     def __init__(
         self, model: ContactModel, measured: Pad | None, pad: SensorPad, check: PatternCheck | None, report: Report
     ) -> None:
-        """Begin with the pad as measured, and the one in use, also by what was learned before."""
         self.waiting = False  # a contact is there to be learned from
         self._pad, self._check, self._report = pad, check, report
         self._learner = GainLearner(model, measured)

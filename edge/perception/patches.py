@@ -87,10 +87,7 @@ def _patch(
 def _forces(
     result: Result, parts: list[NDArray[np.float32]], contract: Contract
 ) -> list[tuple[float, float, float] | None]:
-    """Return the force of each patch in [N]: traction goes to the patches in proportion to their pattern there.
-
-    Where no patch has any, it goes to the nearest one, so that together they are the result's whole force.
-    """
+    """Return the force of each patch: traction goes to the patches by their pattern there, else to the nearest one."""
     if result.traction is None or not parts:
         return [None] * len(parts)
     height, width = result.traction.shape[1:]

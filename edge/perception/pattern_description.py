@@ -50,10 +50,9 @@ def _sums(height: int, width: int, pixel_mm: float) -> NDArray[np.float64]:
 class Balance:
     """Force of one sensor's contacts by the sums of its readings, over which the network's traction is distributed.
 
-    A network weighs each scan anew: the two pads of a gripper, which carry equal and opposite forces, disagree by it
-    where their plain sums agree. So changes of a force are those of the sums, and the network tells what the sums mean:
-    newtons for a count of z and counts of x and y that pressing alone makes, by the contact so far, and newtons for a
-    count of shear, by all contacts of the sensor.
+    By a network the two pads of a gripper, which carry equal and opposite forces, disagree where their plain sums
+    agree. So changes of a force are those of the sums, and the network tells what the sums mean: newtons for a count of
+    z and counts of x and y that pressing makes, by the contact so far, newtons for a count of shear by all contacts.
     """
 
     def __init__(self, geometry: SensorGeometry) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.event import OLD_NS, Event, Note, joined, waited_note
+from edge.perception.event import OLD_NS, Event, Note, joined
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses import PadPose
 from firmware_bridge.scans.scan import Scan
@@ -130,16 +130,17 @@ class Result:
 
     def baseline_text(self) -> str:
         """Return id and age of the baseline."""
-        if self.baseline is None:
-            return "no baseline"
-        if self.baseline_age_s is None:
-            return f"baseline {self.baseline.id} of unknown age"
-        return f"baseline {self.baseline.id} {age_text(self.baseline_age_s)} old"
+        return (
+            "no baseline" if self.baseline is None else f"baseline {self.baseline.id} {age_text(self.baseline_age_s)}"
+        )
 
 
-def age_text(age_s: float) -> str:
-    """Return an age in [s] as text in seconds, minutes or hours."""
-    return f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min" if age_s < 36000 else f"{age_s / 3600:.0f} h"
+def age_text(age_s: float | None) -> str:
+    """Return how old something is, in seconds, minutes or hours."""
+    if age_s is None:
+        return "of unknown age"
+    age = f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min" if age_s < 36000 else f"{age_s / 3600:.0f} h"
+    return f"{age} old"
 
 
 def mask_bits(taxels: NDArray[np.bool_]) -> int:
@@ -224,7 +225,8 @@ class Step:
             waited_ns = done_ns - self.scan.time_ns
             self.latency_us = waited_ns / 1e3
             if waited_ns > OLD_NS:
-                self.notes = (*self.notes, waited_note(waited_ns))
+                late = f"this pattern was ready {waited_ns / 1e9:.2f} s after its newest reading arrived"
+                self.notes = (*self.notes, Note("late", late))
         # What no stage has set is not in the dictionary, and has its default in the result.
         values: dict[str, Any] = dict(vars(self))
         for name in ("readings", "doubted", "due", "estimate"):

@@ -1,8 +1,7 @@
 """Taps of one sensor: contact, the window of a due pattern with its poses, and where to touch next.
 
 Contact has two thresholds on the summed z, so that noise around one of them cannot split a tap. While a tap goes on
-the window holds its current frame, not its peak, so that a robot gets a pattern from the first scan of a tap. Earlier
-taps are remembered by their peaks.
+the window holds its current frame, so that a robot gets a pattern from its first scan; earlier taps have their peaks.
 """
 
 import math
@@ -110,8 +109,8 @@ _SHIFTS_MM: Final = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if 
 def next_shift_mm(places_mm: NDArray[np.floating], reach_mm: float) -> tuple[float, float] | None:
     """Return the shift dx, dy in [mm] from the newest tap, of half a pitch along x, y or both, to touch next.
 
-    Places (K, 2) of the taps so far are in the newest one's axes. The next one must not be further than the reach from
-    any of them that is itself in reach; None where each place was touched or is out of reach.
+    Places (K, 2) of the taps so far are in the newest one's axes, and the next one must be in reach of all that are
+    themselves in reach; None where each place was touched or is out of reach.
     """
     places_mm = places_mm[np.hypot(*places_mm.T) <= reach_mm]
     distances_mm = np.hypot(*(_SHIFTS_MM[:, None] - places_mm).transpose(2, 0, 1))

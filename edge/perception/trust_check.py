@@ -95,7 +95,6 @@ class PatternCheck:
         pad: SensorPad | None = None,
         report: Report = lambda kind, detail="": None,
     ) -> None:
-        """Check with the pad in use; None for an unknown one."""
         self._trust, self._report = trust, report
         self._pad = SensorPad(contract, trust, None, None) if pad is None else pad
         self._unit_counts = contract.counts_per_unit[2]
@@ -112,11 +111,8 @@ class PatternCheck:
     def belonging(
         self, window: NDArray[np.float32], taps: int, poses: NDArray[np.float32] | None = None
     ) -> list[float]:
-        """Return how little each earlier tap of a window in network units belongs to the newest: 0 to 1; from 0.5 not.
-
-        Taps of a model that takes no poses are not checked.
-        """
-        if taps < 2 or poses is None:
+        """Return how little each earlier tap of a window in network units belongs to the newest, 0 to 1."""
+        if taps < 2 or poses is None:  # a model that takes no poses has no such check
             return []
         check, features = self._trust.tap, pose_tap_features(window[:taps], poses[:taps])
         return [_share(score - check.limit) for score in check.network(features)]
@@ -127,7 +123,7 @@ class PatternCheck:
         """Return the numbers of the taps of a window that belong to the contact, and how little each earlier one does.
 
         A press nearly as strong as an earlier one settles it, and the tracker forgets that tap; a lighter one may only
-        have begun. `scaled` is the window in network units.
+        have begun.
         """
         belonging = tuple(self.belonging(scaled, window.taps, window.poses))
         dropped = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]

@@ -1,9 +1,8 @@
 """Stages that know a sensor's rest level: its baseline, taken or stored, and its drift; and whether to believe it.
 
-The shape of a reading does not tell whether it is a touch, or whether drift or an old baseline explains it as well: a
-flat grip moves all taxels together, and so does a pad that has warmed, or is another one than was zeroed. What tells is
-how it began. A touch is quick, and begins from a rest level that was seen in this run; or it is local, and leaves half
-of the pad at rest. All else over a threshold is in doubt.
+A flat grip moves all taxels together, and so does a pad that has warmed, or is another one than was zeroed. What tells
+is how it began. A touch is quick, and begins from a rest level that was seen in this run; or it is local, and leaves
+half of the pad at rest. All else over a threshold is in doubt.
 """
 
 from collections.abc import Callable
@@ -167,13 +166,6 @@ _TEXTS: Final[dict[Doubt, str]] = {
 }
 
 
-def doubt_text(doubt: Doubt, counts: tuple[float, float, float], age_s: float | None) -> str:
-    """Return a doubt in a user's words, with the medians of all taxels on x, y, z and the baseline's age."""
-    seen = "x {:+.0f}, y {:+.0f}, z {:+.0f} counts".format(*counts)
-    age = "of unknown age" if age_s is None else f"{age_text(age_s)} old"
-    return f"baseline in doubt: {_TEXTS[doubt].format(counts=seen)} (baseline {age}); free the pad and zero again"
-
-
 class BaselineDoubt:
     """Stage: decides whether a step's readings may be a touch, and reports when a doubt begins, changes and ends."""
 
@@ -221,7 +213,9 @@ class BaselineDoubt:
         if doubt is None:
             self._report("baseline_cleared", "")
         else:
-            text = doubt_text(doubt, self.counts, step.baseline_age_s)
+            why = _TEXTS[doubt].format(counts="x {:+.0f}, y {:+.0f}, z {:+.0f} counts".format(*self.counts))
+            age = age_text(step.baseline_age_s)
+            text = f"baseline in doubt: {why} (baseline {age}); free the pad and zero again"
             self.notes = (Note("baseline_in_doubt", text),)
             self._report("baseline_doubted", text)
 
