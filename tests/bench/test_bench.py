@@ -123,6 +123,8 @@ def test_a_head_is_read_as_written_with_the_hashes_of_its_inputs(made):
     assert read_provenance(with_head("# b\n", bare)) == bare
     assert made.sources == {name: file_hash(ROOT / name) for name in (SOURCE, "edge/bench")} and made.seed == 3
     assert made.models == {f"edge/models/{DEFAULT_MODEL}.onnx": file_hash(find_model(DEFAULT_MODEL))}
+    for head in ("", "```toml\ncommand = \n```\n", '```toml\ncommand = "x"\n```\n'):
+        assert read_provenance(f"# none, or damaged\n\n{head}") is None
     assert made.tree in {"clean", "changed", UNKNOWN} and len(set(made.sources.values())) == 2
 
 
@@ -137,13 +139,6 @@ def test_a_source_has_changed_where_its_code_has(tmp_path, other, same):
     (tmp_path / "a.py").write_text('"""A."""\nimport a\n\n\ndef f():\n    """Return 1."""\n    return 1\n')
     (tmp_path / "b.py").write_text(other)
     assert (file_hash(tmp_path / "a.py") == file_hash(tmp_path / "b.py")) is same
-
-
-@pytest.mark.parametrize(
-    "page", ["# no head\n", "# a\n\n```toml\ncommand = \n```\n", '# a\n\n```toml\ncommand = "x"\n```\n']
-)
-def test_a_head_that_lacks_or_is_damaged_is_none(page):
-    assert read_provenance(page) is None
 
 
 @pytest.mark.parametrize(
@@ -206,14 +201,11 @@ def test_ticks_whose_run_is_not_done_in_time_are_missed(took_ms, ticks, done, mi
     assert found.cpu_percent == pytest.approx(25) and found.times.max_us == 1e3 * max(took_ms)
 
 
-@pytest.mark.parametrize(
-    ("took_ms", "most", "runs"), [(1, 3000, 2000), (0.1, 3000, 3000), (200, 3000, 90), (200, 10, 10)]
-)
-def test_back_to_back_is_as_many_runs_as_fit(took_ms, most, runs):
-    clock = Clock()
-    run, _ = clock.work(took_ms)
-    found = back_to_back(run, most, clock)
-    assert (found.runs, found.p50_us) == (runs, took_ms * 1000)
+def test_back_to_back_is_as_many_runs_as_fit():
+    for took_ms, most, runs in ((1, 3000, 2000), (0.1, 3000, 3000), (200, 3000, 90)):
+        run, _ = (clock := Clock()).work(took_ms)
+        found = back_to_back(run, most, clock)
+        assert (found.runs, found.p50_us) == (runs, took_ms * 1000)
 
 
 def test_the_programs_cost_is_a_line_for_rest_and_for_contact(limits, capsys):

@@ -53,14 +53,6 @@ def test_perfect_patterns_of_a_letter_give_its_outline(turns):
     assert abs(area_mm2 - (here[known] == 0).sum() / 16) < 0.1 * edge_mm
 
 
-def test_a_deeper_press_does_not_raise_the_map():
-    layers = fused(letter, over(letter, raster(step_mm=8.0)), (0.2, 0.45)).layers()
-    x_mm, y_mm = pixels_mm(ObjectMap().grid)
-    inside = np.all([letter(x_mm + dx, y_mm + dy) == 0 for dx in (-1, 1) for dy in (-1, 1)], axis=0)
-    assert np.abs(layers.height_mm[inside & (layers.coverage > 0)]).max() < 0.01
-    assert np.nanmax(fused(dome, [HERE, HERE], (0.2, 0.45)).layers().height_mm) < 0.01
-
-
 def test_heights_of_a_curved_part_agree_between_presses():
     layers = fused(dome, [PadPose(float(x), 0.0, 0.0, 0.0, 0.0) for x in range(-12, 13, 3)], (0.4, 0.25)).layers()
     x_mm, y_mm = pixels_mm(ObjectMap().grid)

@@ -158,17 +158,13 @@ class TestPoses:
             np.testing.assert_allclose(posed.run(window[again], poses=poses[again]), expected, atol=1e-5)
 
     def test_windows_of_several_lengths_run_together(self, tmp_path):
-        contract = make_posed_contract(interval_factor=1.6)
-        session = ModelSession(write_posed_model(tmp_path / "several.onnx", contract))
-        for lengths in ((4, 1, 7), (1, 3, 2), (4, 7, 1)):  # the last ones are where others lay before
-            taps = [random_taps(length, seed) for seed, length in enumerate(lengths)]
-            windows, poses = zip(*taps, strict=True)
-            together = session.run_together(windows, None, poses).copy()
-            deviations = session.deviation.copy()
-            for index, (window, rows) in enumerate(taps):
-                np.testing.assert_allclose(together[index], posed_pattern(window, rows), atol=1e-5)
-                session.run(window, poses=rows)
-                np.testing.assert_allclose(deviations[index], session.deviation, atol=1e-6)
+        session = ModelSession(write_posed_model(tmp_path / "m.onnx", make_posed_contract(interval_factor=1.6)))
+        windows, poses = zip(*(random_taps(length, seed) for seed, length in enumerate((4, 1, 7))), strict=True)
+        made = zip(session.run_together(windows, None, poses).copy(), session.deviation.copy(), strict=True)
+        for window, rows, (pattern, deviation) in zip(windows, poses, made, strict=True):
+            np.testing.assert_allclose(pattern, posed_pattern(window, rows), atol=1e-5)
+            session.run(window, poses=rows)
+            np.testing.assert_allclose(deviation, session.deviation, atol=1e-6)
 
     def test_without_poses_taps_follow_the_schedule(self, posed):
         window, _ = random_taps(4)
