@@ -12,8 +12,6 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from edge.api import USPA44, Baseline, EdgeError, demo_recording
 from edge.inference.bundled import TAXELS
 from edge.perception import taxel_health as health
-from edge.perception.event import joined
-from edge.perception.result import Step
 from edge.perception.taxel_health import (
     BACK_SCANS,
     FAR_SCANS,
@@ -21,7 +19,6 @@ from edge.perception.taxel_health import (
     STUCK_SCANS,
     TAXEL_SILENT_SCANS,
     WIDENING,
-    Health,
     filler,
     load_estimator,
     ridged,
@@ -30,41 +27,32 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
 
-
-def followed(watch, scan, baseline):
-    """Return the step of a scan after the stage."""
-    step = Step(scan, "device", "m", "mm")
-    watch(step, baseline)
-    watch.fill(step)
-    return step
+ESTIMATOR = load_estimator(TAXELS, (4, 4))
 
 
 class Pad:
-    """A watched pad with noise; `faults` change a scan's counts (3, 16) in place."""
+    """A pad with noise; `faults` change a scan's counts (3, 16) in place."""
 
     def __init__(self, baseline=BASELINE, seed=0, noise_counts=2.0):
-        self.watch = Health((4, 4), estimator=ESTIMATOR)
-        self._baseline = baseline
-        self._series = ScanSeries("4", USPA44)
-        self._rng = np.random.default_rng(seed)
-        self._noise_counts = noise_counts
-        self._number = 0
+        self._runtime = make_runtime(baselines={"4": baseline}, estimator=ESTIMATOR)
+        self._series, self._rng, self._noise_counts = ScanSeries("4", USPA44), np.random.default_rng(seed), noise_counts
+        self._time_ns = 0
+
+    def push(self, counts, later_ns=PERIOD_NS):
+        """Return the reasons after a scan."""
+        self._time_ns += later_ns
+        self.result = self._runtime.push(self._series.close(counts.astype(np.int32), self._time_ns))
+        return dict(self.result.dead)
 
     def read(self, scans, *faults):
-        """Reasons after each of so many scans."""
+        """Return the reasons after each of so many scans."""
         told = []
         for _ in range(scans):
-            counts = REST + np.rint(self._rng.normal(0, self._noise_counts, REST.shape)).astype(np.int32)
+            counts = np.rint(REST + self._rng.normal(0, self._noise_counts, REST.shape))
             for fault in faults:
                 fault(counts.reshape(3, 16))
-            self._number += 1
-            self.step = followed(self.watch, self._series.close(counts, self._number * PERIOD_NS), self._baseline)
-            told.append(dict(self.watch.reasons))
+            told.append(self.push(counts))
         return told
-
-    @property
-    def note(self):
-        return joined(self.step.notes) or ""
 
 
 def at(taxel, *readings):
@@ -109,7 +97,6 @@ class TestWatch:
         pad = Pad()
         assert not any(pad.read(50) + pad.read(after, fault))
         assert pad.read(30, fault) == [{7: reason}] * 30
-        assert pad.watch.dead.ravel().tolist() == [taxel == 7 for taxel in range(16)]
         back = pad.read(BACK_SCANS + 5)
         assert back[: BACK_SCANS - 1] == [{7: reason}] * (BACK_SCANS - 1) and back[-1] == {}
 
@@ -123,8 +110,8 @@ class TestWatch:
         pad = Pad(noise_counts=0)
         assert not any(pad.read(health.FROZEN_SENSOR_SCANS))
         assert pad.read(1) == [dict.fromkeys(range(16), "stuck")]
-        assert pad.step.readings is None
-        assert pad.note == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
+        assert pad.result.state == "incomplete"
+        assert pad.result.note == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
 
     @pytest.mark.parametrize(
         ("stuck", "after"), [(1, STUCK_SCANS), (8, STUCK_SCANS), (12, STUCK_SCANS), (13, health.FROZEN_SCANS)]
@@ -135,7 +122,7 @@ class TestWatch:
         told = pad.read(after + 5, *(at(taxel, *STUCK) for taxel in range(stuck)))
         # A living taxel repeats itself now and then, and with few of them a scan then shows nothing.
         assert not any(told[:after]) and told[-1] == dict.fromkeys(range(stuck), "stuck")
-        assert (pad.step.filled == "neighbours") == (stuck <= 8)
+        assert (pad.result.filled == "neighbours") == (stuck <= 8)
 
     def test_the_dead_do_not_count_among_those_that_should_be_new(self):
         pad = Pad()
@@ -154,8 +141,8 @@ class TestWatch:
     def test_a_taxel_without_reading_or_rest_is_never_believed(self):
         pad = Pad()
         pad.read(1, silent(2))
-        assert pad.step.readings is None and not pad.step.dead
-        assert pad.read(HOLD_SCANS, silent(2))[-1] == {2: "silent"} and pad.step.filled == "neighbours"
+        assert pad.result.state == "incomplete" and not pad.result.dead
+        assert pad.read(HOLD_SCANS, silent(2))[-1] == {2: "silent"} and pad.result.filled == "neighbours"
         counts = BASELINE.counts.copy()
         counts[:, 1, 2] = np.nan
         assert Pad(Baseline.of("4", counts, 0.0, 100, "start-up")).read(50)[-1] == {6: "unzeroed"}
@@ -175,24 +162,11 @@ class TestWatch:
     )
     def test_a_reading_from_before_a_pause_is_not_held(self, pause_ns, held, torn_before):
         """Five scans are 50 ms at 100 Hz, but whole ones may have vanished: before was another press."""
-        watch, series = Health((4, 4)), ScanSeries("4", USPA44)
-        for number, (time_ns, taxel) in enumerate(
-            [(0, None), (PERIOD_NS, 0 if torn_before else None), (2 * PERIOD_NS, None), (2 * PERIOD_NS + pause_ns, 7)]
-        ):
-            counts = REST + number
-            if taxel is not None:
-                counts.reshape(3, 16)[:, taxel] = ABSENT
-            followed(watch, series.close(counts, time_ns), BASELINE)
-        assert watch.reasons == ({} if held else {7: "silent"})
-
-
-def raised(counts, baseline):
-    """Reasons over the scans of one recording."""
-    watch, series, found = Health((4, 4)), ScanSeries("4", USPA44), []
-    for number, row in enumerate(counts):
-        followed(watch, series.close(row.astype(np.int32), number * PERIOD_NS), baseline)
-        found.append(dict(watch.reasons))
-    return [reasons for reasons in found if reasons]
+        pad = Pad()
+        assert not any(pad.read(1) + pad.read(1, *[silent(0)] * torn_before) + pad.read(1))
+        torn = REST + 1
+        silent(7)(torn.reshape(3, 16))
+        assert pad.push(torn, pause_ns) == ({} if held else {7: "silent"})
 
 
 @pytest.mark.parametrize("path", [demo_recording(), *sorted(REAL_RECORDINGS.glob("*/xela_*.csv"))], ids=str)
@@ -200,7 +174,8 @@ def test_neither_the_demo_nor_real_grips_raise_anything(path):
     counts = load_recording(path).tracks[0].counts
     # Zeroed in the grip, as a robot may, and where the grip has been let go.
     for rest in (counts[:100], counts[-20:])[: 1 + (path.suffix == ".csv")]:
-        assert raised(counts, Baseline.from_counts("4", rest, 0.0)) == []
+        pad = Pad(Baseline.from_counts("4", rest, 0.0))
+        assert not any(pad.push(row) for row in counts)
 
 
 def saturated(pad, counts, press=PRESS, **changes):
@@ -262,9 +237,6 @@ class TestRuntime:
         back = [pad.push(PRESS) for _ in range(BACK_SCANS)][-1]
         assert back.state == "contact" and len(back.notes) == 1 and back.dead == {}
         assert [saturated(pad, 65534).state for _ in range(HOLD_SCANS + 2)][-1] == "contact", "a count from the end"
-
-
-ESTIMATOR = load_estimator(TAXELS, (4, 4))
 
 
 @pytest.mark.parametrize("kind", [0, 1])
