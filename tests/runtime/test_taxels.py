@@ -158,7 +158,7 @@ class TestWatch:
 
     @pytest.mark.parametrize(
         ("pause_ns", "held", "torn_before"),
-        [(health.HOLD_NS, True, True), (health.HOLD_NS + 1, False, True), (health.HOLD_NS + 1, False, False)],
+        [*((health.HOLD_NS, True, torn) for torn in (0, 1)), *((health.HOLD_NS + 1, False, torn) for torn in (0, 1))],
     )
     def test_a_reading_from_before_a_pause_is_not_held(self, pause_ns, held, torn_before):
         """Five scans are 50 ms at 100 Hz, but whole ones may have vanished: before was another press."""
