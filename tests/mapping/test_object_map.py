@@ -154,14 +154,11 @@ def test_a_size_out_of_range_and_another_unit_are_refused():
         ObjectMap().add(result_of(dome, HERE, pattern_unit="counts"), HERE)
 
 
-NONE = {"dropped": 0}
-
-
 def touched(sink, places=((0.0, 0.0),), *, posed=True, first=0, **changes):
     """Press a letter at places, each for a scan."""
     for number, (x_mm, y_mm) in enumerate(places, first):
         pose = PadPose(x_mm, y_mm)
-        sink.write(result_of(letter, pose, number=number, posed=posed, **changes), NONE)
+        sink.write(result_of(letter, pose, number=number, posed=posed, **changes), {})
 
 
 def test_layers_come_back_from_their_file(tmp_path):
@@ -197,7 +194,7 @@ def test_a_reset_ends_a_map_and_begins_the_next(tmp_path):
     touched(sink, events=reset)
     (tmp_path / "m-2.npz").write_text("a good one")
     touched(sink, ((10.0, 0.0), (-10.0, 0.0)), first=1)
-    sink.write(result_of(letter, PadPose(0.0, 0.0), number=3, events=reset, trusted=False), NONE)
+    sink.write(result_of(letter, PadPose(0.0, 0.0), number=3, events=reset, trusted=False), {})
     assert np.load(tmp_path / "m.npz")["fused_patterns"] == 3, "the press that lasted belongs to the object before"
     touched(sink, ((-8.0, 0.0), (8.0, 0.0)), first=4)
     sink.close()
@@ -218,7 +215,7 @@ def test_two_pads_at_one_place_are_not_fused():
             for sink, place_mm in ((shared, number + x_mm / 20), (apart, number + x_mm)):
                 pose = PadPose(place_mm, 0.0)
                 result = result_of(letter, pose, number=number, sensor=sensor)
-                sink.write(result if pressing else replace(result, pattern=None, contact=False), NONE)
+                sink.write(result if pressing else replace(result, pattern=None, contact=False), {})
     assert set(shown[-1].pads) == {"4", "6"}
     touched(apart, ((9.0, 0.0),), first=200)  # as after another link was lost
     for sink in (shared, apart):

@@ -9,7 +9,7 @@ from edge_samples import write_model
 
 from edge.errors import ModelError, UsageError, WindowError
 from edge.evaluation.classical_methods import fitted_methods
-from edge.evaluation.test_set import FrozenSet, FrozenSetError, judge, judge_model, load_frozen_set, mean_error
+from edge.evaluation.test_set import FrozenSetError, judge, judge_model, load_frozen_set, mean_error
 from edge.inference import bundled
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, POSED_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
@@ -105,35 +105,22 @@ def test_the_papers_names_are_the_model_of_several_taps():
 
 @pytest.fixture
 def small():
-    rng = np.random.default_rng(0)
-    return FrozenSet(
-        newest=rng.integers(-50, 50, (6, 3, 4, 4)).astype(np.int16),
-        earlier=rng.integers(-50, 50, (2, 3, 3, 4, 4)).astype(np.int16),
-        tap=np.array([0, 0, 0, 1, 1, 1], dtype=np.int16),
-        indentation_mm=np.linspace(0.1, 0.6, 6).astype(np.float32),
-        force_n=np.linspace(1, 6, 6).astype(np.float32),
-        unit_patterns=np.stack([np.eye(40), np.full((40, 40), 0.5)]).astype(np.float16),
-        touched=np.stack([np.eye(40) > 0, np.zeros((40, 40), dtype=bool)]),
-        surface=np.array(["C", "F"]),
-        angle_deg=np.array([0, 30], dtype=np.float32),
-        full_scale_mm=0.5,
-    )
+    return frozen().thinned(100)
 
 
 class TestSet:
     def test_windows_are_newest_first_and_absent_taps_are_zero(self, small):
-        windows = small.windows(4)
-        assert windows.shape == (6, 4, 3, 4, 4)
-        assert (windows[4, 0] == small.newest[4]).all() and (windows[4, 2] == small.earlier[1, 1]).all()
+        windows, tap = small.windows(4), small.tap[4]
+        assert windows.shape == (len(small), 4, 3, 4, 4)
+        assert (windows[4, 0] == small.newest[4]).all() and (windows[4, 2] == small.earlier[tap, 1]).all()
         given_two = small.windows(4, given=2)
         assert (given_two[:, :2] == windows[:, :2]).all() and not given_two[:, 2:].any()
         for taps in (0, 8):
             with pytest.raises(FrozenSetError, match=f"windows of {taps} taps asked for, the frozen test set has"):
                 small.windows(taps)
         # The truth is the unit pattern times the indentation.
-        assert np.allclose(small.patterns()[5], 0.5 * 0.6)
-        assert np.allclose(small.patterns()[1].diagonal(), small.indentation_mm[1])
-        assert small.touching()[0].sum() == 40 and not small.touching()[5].any() and small.scale == 10
+        assert np.allclose(small.patterns()[4], small.unit_patterns[tap].astype(float) * small.indentation_mm[4])
+        assert (small.touching()[4] == small.touched[tap]).all() and small.scale == 10
 
     def test_a_file_gives_back_the_set_and_a_bad_one_replaces_none(self, small, tmp_path):
         path = tmp_path / "set.npz"
