@@ -21,16 +21,14 @@ def one_node(operator: str, domain: str = "") -> bytes:
 
 
 class TestOperators:
-    @pytest.mark.parametrize("operator", ["Loop", "Scan", "LSTM", "RandomNormal", "SequenceMap", "Range", "relu"])
-    def test_one_that_is_not_listed_is_refused(self, operator):
-        with pytest.raises(ModelError, match=r"has operator '.*', expected only those that docs/formats.md lists"):
-            check_plain(one_node(operator))
-
-    @pytest.mark.parametrize("domain", ["com.microsoft", "ai.onnx.ml", "pkg.mine", "ai.onnx.preview.training"])
-    def test_one_of_another_domain_is_refused(self, domain):
+    def test_one_that_is_not_listed_or_of_another_domain_is_refused(self):
         check_plain(one_node("Relu", "ai.onnx"))
-        with pytest.raises(ModelError, match=f"domain '{domain}', expected ONNX's own alone"):
-            check_plain(one_node("Relu", domain))
+        for operator in ("Loop", "LSTM", "RandomNormal", "Range", "relu"):
+            with pytest.raises(ModelError, match=r"has operator '.*', expected only those that docs/formats.md lists"):
+                check_plain(one_node(operator))
+        for domain in ("com.microsoft", "ai.onnx.ml", "pkg.mine"):
+            with pytest.raises(ModelError, match=f"domain '{domain}', expected ONNX's own alone"):
+                check_plain(one_node("Relu", domain))
 
     def test_of_a_node_with_two_operators_both_count(self):
         two = onnx.NodeProto(op_type="Loop").SerializeToString() + onnx.NodeProto(op_type="Relu").SerializeToString()

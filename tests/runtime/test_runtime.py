@@ -131,22 +131,17 @@ class TestAway:
         assert result.state == state and (result.pattern is not None) == (state == "contact")
         assert pad.push(PRESS).taps_used == (2 if state == "contact" else 1), "taps from before are forgotten as well"
 
-    @pytest.mark.parametrize(
-        ("delay_ns", "unread_ns", "note"),
-        [
-            (0, 0, None),
-            (50_000_000, 0, None),
-            (50_000_001, 0, "this reading was 0.05 s old when it arrived"),
-            (None, 4_980_000_000, "may have been 4.98 s old when it arrived"),
-            (1000, 4_980_000_000, None),  # the device knows better
-        ],
-    )
-    def test_a_reading_that_is_old_or_may_be_is_told(self, delay_ns, unread_ns, note):
-        scan = make_scan(press_counts=PRESS)
-        device_ns = None if delay_ns is None else scan.time_ns - delay_ns
-        notes = make_runtime().push(dataclasses.replace(scan, device_ns=device_ns, unread_ns=unread_ns)).notes
-        late = [one.text for one in notes if one.kind == "late"]
-        assert len(late) == (note is not None) and (note is None or note in late[0])
+    def test_a_reading_that_is_old_or_may_be_is_told(self):
+        for delay_ns, unread_ns, told in (
+            (50_000_000, 0, []),
+            (50_000_001, 0, ["this reading was 0.05 s old when it arrived"]),
+            (None, 4_980_000_000, ["this reading may have been 4.98 s old when it arrived"]),
+            (1000, 4_980_000_000, []),  # the device knows better
+        ):
+            scan = make_scan(press_counts=PRESS)
+            device_ns = None if delay_ns is None else scan.time_ns - delay_ns
+            notes = make_runtime().push(dataclasses.replace(scan, device_ns=device_ns, unread_ns=unread_ns)).notes
+            assert [one.text for one in notes if one.kind == "late"] == told
 
 
 def make_pad(**settings):
