@@ -142,18 +142,13 @@ def measured(job: dict[str, Any]) -> dict[str, Any]:
     # The child imports the same modules as this process, however they were located.
     script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.timing import main; sys.exit(main())"
     libraries = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM")
-    variables = {f"{library}_THREADS": "1" for library in libraries}
-    command, pipe = [sys.executable, "-c", script], subprocess.PIPE
-    environment = os.environ | variables
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as child:
-        try:
-            output, complaint = child.communicate(json.dumps(job))
-        finally:
-            child.kill()  # after a Ctrl-C, Popen itself would leave it running
-    if child.returncode != 0:
-        last = (complaint.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
+    environment = os.environ | {f"{library}_THREADS": "1" for library in libraries}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, input=json.dumps(job), capture_output=True, text=True, env=environment, check=False)
+    if done.returncode != 0:
+        last = (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
         raise BenchError(f"the run time of {job['subject']['name']} was not measured: {last}")
-    return json.loads(output)
+    return json.loads(done.stdout)
 
 
 def _percentiles(times: dict[str, Any]) -> tuple[str, str, str, str]:

@@ -28,8 +28,8 @@ MOST_MISMATCH: Final = 0.8  # nine in ten of another press's patterns exceed it,
 # Doubt, at a strongest z of 1000 counts, beyond which the model is not sure. With the other checks 3.5 % of simulated
 # contacts less than 30 % off are not believed, and 34 % of those over 50 % off.
 MOST_DOUBT: Final = 0.61
-SUSPECTED: Final = "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
+SUSPECTED: Final = "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
 
 
 class SensorPad:

@@ -100,8 +100,7 @@ def write_model(path: Path, contract: Contract | None = None, *, metadata=None, 
     ]
     if pad_width:
         nodes[:0] = [
-            helper.make_node("Mul", [PAD_NAME, "pad_weights"], ["weighed"]),
-            helper.make_node("ReduceSum", ["weighed", "axis"], ["stiffer"], keepdims=1),
+            helper.make_node("MatMul", [PAD_NAME, "pad_weights"], ["stiffer"]),
             helper.make_node("Add", ["stiffer", "one"], ["stiff"]),
             helper.make_node("Unsqueeze", ["stiff", "last"], ["stiffness"]),
         ]
@@ -125,7 +124,7 @@ def write_model(path: Path, contract: Contract | None = None, *, metadata=None, 
         "axis": np.array([1]),
         "last": np.array([2, 3]),
         "one": np.array([[1]], dtype=np.float32),
-        "pad_weights": np.arange(1, (pad_width or 1) + 1, dtype=np.float32)[None],
+        "pad_weights": np.arange(1, (pad_width or 1) + 1, dtype=np.float32)[:, None],
         "doubt": np.array(doubt, dtype=np.float32),
         **({} if pad_width else {"stiffness": np.ones((1, 1, 1, 1), dtype=np.float32)}),
     }
@@ -211,10 +210,8 @@ class FakeModel:
     """Tiny model without onnxruntime."""
 
     def __init__(self, contract: Contract | None = None) -> None:
-        self.name = "fake"
-        self.contract = contract or make_contract()
-        self.windows: list[np.ndarray] = []
-        self.pads: list[np.ndarray | None] = []
+        self.name, self.contract = "fake", contract or make_contract()
+        self.windows, self.pads = [], []
         self.deviation: np.ndarray | None = None
         self.traction: np.ndarray | None = None
 
@@ -276,8 +273,7 @@ class FakeLink(Link):
                 raise self._error
             if self._endless:
                 time.sleep(min(timeout_s, 0.01))
-                return []
-            self.ended = True
+            self.ended = not self._endless
             return []
         batch = self._batches.pop(0)
         if isinstance(batch, threading.Event):
