@@ -79,7 +79,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     lines: list[dict[str, Any]] = []
     try:
         _errors(everyone, frozen, lines, page)
-        _run_times(everyone, options, lines, page)
+        _run_times(everyone, options.ticks, lines, page)
     except KeyboardInterrupt:
         kept = f": what was measured is in {options.out}" if options.out else ""
         page.warn(f"bench stopped before its end{kept}")
@@ -113,12 +113,7 @@ def _error_cells(error: dict[str, float]) -> tuple[str, ...]:
     )
 
 
-def _run_times(
-    everyone: Sequence[Subject],
-    options: argparse.Namespace,
-    lines: list[dict[str, Any]],
-    page: BenchPage,
-) -> None:
+def _run_times(everyone: Sequence[Subject], ticks: int, lines: list[dict[str, Any]], page: BenchPage) -> None:
     columns = ("method", *(f"back to back {figure}" for figure in _FIGURES.values()))
     columns += (*(f"{RATE_HZ:g} Hz {figure}" for figure in _FIGURES.values()), "missed", "CPU %")
     text = (
@@ -127,7 +122,7 @@ def _run_times(
     )
     page.section("Run time", text, columns)
     for subject in everyone:
-        answer = measured({"subject": subject._asdict(), "rate_hz": RATE_HZ, "ticks": options.ticks})
+        answer = measured({"subject": subject._asdict(), "rate_hz": RATE_HZ, "ticks": ticks})
         paced, both = answer["paced"], {"back_to_back": answer["back_to_back"], "paced": answer["paced"]["times"]}
         cells = [cell for times in both.values() for cell in _percentiles(times)]
         cells += [f"{paced['missed']} of {paced['ticks']}", f"{paced['cpu_percent']:.1f}"]

@@ -81,10 +81,7 @@ class ErrorRow(NamedTuple):
 
 
 def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
-    """Yield the error of a classical method with the newest tap, of a model with one tap and with all it takes.
-
-    Raises an EdgeError where the model cannot be used, or is of another scale or more taps than the test set.
-    """
+    """Yield the error of a method with the newest tap, of a model with one and with all, or raise an EdgeError."""
 
     def row(
         given: int, patterns: NDArray[np.floating], level: float, half_width_mm: NDArray[np.floating] | None = None

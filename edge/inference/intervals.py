@@ -23,10 +23,7 @@ def near_pixels(scale: int, pitch_mm: float) -> int:
 
 
 def regions(patterns: NDArray[np.floating], contact_level: float, near: int) -> NDArray[np.int8]:
-    """Return each pixel's region as an index of REGIONS, (n, H, W), of patterns (n, H, W).
-
-    A pixel from `contact_level` of its pattern's maximum is touched; `near` pixels from the contact are near it.
-    """
+    """Return each pixel's region as an index of REGIONS, (n, H, W); `near` pixels from the contact are near it."""
     touched = patterns > np.float32(contact_level) * patterns.max(axis=(1, 2), keepdims=True)
     inside, edge = ~_grown(~touched, 1), _grown(touched, 1)
     return np.select([inside, edge, _grown(touched, near)], [0, 1, 2], 3).astype(np.int8)

@@ -130,9 +130,9 @@ class Result:
 
     def baseline_text(self) -> str:
         """Return id and age of the baseline."""
-        return (
-            "no baseline" if self.baseline is None else f"baseline {self.baseline.id} {age_text(self.baseline_age_s)}"
-        )
+        if self.baseline is None:
+            return "no baseline"
+        return f"baseline {self.baseline.id} {age_text(self.baseline_age_s)}"
 
 
 def age_text(age_s: float | None) -> str:

@@ -70,10 +70,7 @@ class Sensor:
             self._doubt.begin(baseline.origin)
 
     def follow(self, step: Step, track: PoseTrack | None, events: list[Callable[[int], Event]]) -> None:
-        """Pass the step of the sensor's next scan through the stages before the model; a window is due then, or none.
-
-        It takes the events of all sensors with its own; `track` has the poses of its pad.
-        """
+        """Pass the step of the next scan, which takes the events of all, through the stages before the model."""
         scan = step.scan
         if self._received_ns is not None and scan.time_ns - self._received_ns > TAPS_FORGOTTEN_NS:
             self.lose_touch()

@@ -146,7 +146,6 @@ class Taps:
     ) -> None:
         self._tracker, self._health = tracker, health
         self._contract, self._report = contract, report
-        self._takes_poses = contract.takes_poses
         self._most = contract.taps if options.taps is None else options.taps
         self._scheduled = options.taps or contract.unposed_taps
         self._on_counts = options.contact_on_counts
@@ -169,14 +168,14 @@ class Taps:
             step.state, step.contact, step.due = "contact", True, self._window(step, tap, scheduled=track is None)
         elif not step.doubted:
             step.state, step.contact = "idle", False
-            if tap.peaks and self._takes_poses:
+            if tap.peaks and self._contract.takes_poses:
                 step.next_tap = self._propose(tap.peaks)
         else:
             step.state = "baseline_in_doubt"
             if z_counts >= self._on_counts:  # to be looked at, and made from this scan alone
                 counts = np.zeros((self._contract.taps, *readings.shape), dtype=np.float32)
                 counts[0] = readings
-                rows = scheduled_rows(1, 0.0) if self._takes_poses else None
+                rows = scheduled_rows(1, 0.0) if self._contract.takes_poses else None
                 step.due = Window(counts, 1, (0,), rows, NO_TAP, (NO_TAP, step.filled))
 
     def see(self, tap: int, z_counts: float, pose: PadPose | None, taps_used: int) -> None:
@@ -185,7 +184,7 @@ class Taps:
             self._strongest = tap, z_counts, pose if taps_used < self._most else None
 
     def _window(self, step: Step, tap: TapTracker, *, scheduled: bool) -> Window:
-        if self._takes_poses:
+        if self._contract.takes_poses:
             slots, rows = self._choose(tap, step.pose, scheduled=scheduled)
             slots, rows = tuple(slots[: self._most]), rows[: self._most]
             taps = len(slots)
