@@ -33,15 +33,10 @@ def pressed(*presses, height=letter):
     return whole
 
 
-def over(height, poses):
-    """Return the poses from which the pad touches the figure, and not the plate beside it."""
-    turned = [(pose, result_of(height, pose).pattern) for pose in poses]
-    return [pose for pose, pattern in turned if 0 < (pattern > 0.15).mean() < 0.9]
-
-
 @pytest.mark.parametrize("turns", [(0.0,), (90.0,), (0.0, 45.0, -120.0)], ids=["straight", "upright", "mixed"])
 def test_perfect_patterns_of_a_letter_give_its_outline(turns):
-    whole = fused(letter, over(letter, raster(turns)))
+    touching = [pose for pose in raster(turns) if 0 < (result_of(letter, pose).pattern > 0.15).mean() < 0.9]
+    whole = fused(letter, touching)  # without those where it touches the plate beside the figure
     layers = whole.layers()
     x_mm, y_mm = pixels_mm(whole.grid)
     known = np.isfinite(layers.contact)

@@ -17,9 +17,9 @@ def make_tracker(taps, idle_reset_s=5.0):
     return TapTracker(taps, RuntimeOptions(idle_reset_s=idle_reset_s))
 
 
-def push(tracker, z_counts, time_ns=0, mark=0.0, **how):
+def push(tracker, z_counts, time_ns=0, mark=0.0):
     """Push a frame of that summed z, told from others by a mark."""
-    tracker.push(np.full((3, 4, 4), mark, dtype=np.float32), z_counts, time_ns, time_ns, **how)
+    tracker.push(np.full((3, 4, 4), mark, dtype=np.float32), z_counts, time_ns, time_ns)
     return tracker
 
 
@@ -99,13 +99,6 @@ def test_after_a_reset_a_tap_in_progress_is_the_first():
     assert play(tracker, [0, 2000])[2] == "23", "one that is over keeps its number"
     tracker.reset()
     assert push(tracker, 0, S).peaks == (), "one that ends at once is none"
-
-
-def test_a_scan_in_doubt_is_no_contact_and_ends_one():
-    tracker = make_tracker(2)
-    assert not push(tracker, 9000, doubted=True).contact
-    assert play(tracker, [2000, 2000])[0] == "11"
-    assert not push(tracker, 9000, S, doubted=True).contact and len(tracker.peaks) == 1
 
 
 def test_settings_that_cannot_be_are_refused():

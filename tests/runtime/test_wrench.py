@@ -76,13 +76,13 @@ def test_force_follows_the_readings_whatever_the_network_finds(press):
         assert force_n[:2] == pytest.approx(strength * drag_n, abs=0.05 if strength == 1 else 0.4), number
 
 
-@pytest.mark.parametrize(("off", "most"), [(20.0, 3.0), (-5.0, 0.5)])
-def test_shear_is_never_scaled_beyond_what_pads_differ_by(press, off, most):
-    balance, pattern, traction, readings, operator, drag_n = press
-    found = traction * np.array([off, off, 1], np.float32)[:, None, None]
-    for _ in range(300):
-        force_n = wrench_of(balance(found, pattern, readings, 9, operator), CELL_MM).force_n
-    assert force_n[:2] == pytest.approx(most * drag_n, abs=0.1)
+def test_shear_is_never_scaled_beyond_what_pads_differ_by(press):
+    _, pattern, traction, readings, operator, drag_n = press
+    for off, most in ((20.0, 3.0), (-5.0, 0.5)):
+        found, balance = traction * np.array([off, off, 1], np.float32)[:, None, None], Balance(USPA44)
+        for _ in range(300):
+            force_n = wrench_of(balance(found, pattern, readings, 9, operator), CELL_MM).force_n
+        assert force_n[:2] == pytest.approx(most * drag_n, abs=0.1)
 
 
 def test_where_nothing_presses_the_traction_stays(press):
@@ -119,9 +119,8 @@ def test_ros_takes_the_wrench_before_the_calibrated_force():
     assert told is not None and told[0] == both.wrench.force_n and not math.isnan(told[1][2])
 
 
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
+def test_a_record_states_how_far_its_newtons_may_be_off():
+    for settings, expected in (
         ({}, 0.45),  # 90 % of the even range of the sensors that the model was trained for
         ({"counts_per_newton": 1500.0}, None),
         ({"counts_per_newton": {"4": 1500.0}, "scale_intervals": {"4": (1410.0, 1590.0)}}, 0.06),
@@ -133,12 +132,10 @@ def test_ros_takes_the_wrench_before_the_calibrated_force():
         ({"pad": Pad(counts_per_newton=1200.0, intervals=NEAR)}, 0.25),  # to its farther end
         ({"pad": Pad(intervals=NEAR), "counts_per_newton": 1500.0}, None),  # that is no interval of these
         ({"pad": Pad(counts_per_newton=1200.0), "scale_intervals": {"4": (1140.0, 1260.0)}}, None),
-    ],
-)
-def test_a_record_states_how_far_its_newtons_may_be_off(settings, expected):
-    made = make_wrench_result(**settings)
-    assert made.scale_error == (None if expected is None else pytest.approx(expected))
-    assert made.wrench_origin == ("nominal" if expected == 0.45 else "calibrated")
+    ):
+        made = make_wrench_result(**settings)
+        assert made.scale_error == (None if expected is None else pytest.approx(expected)), settings
+        assert made.wrench_origin == ("nominal" if expected == 0.45 else "calibrated")
 
 
 CONTRACT = make_contract(scale=10, contact_level=0.5)

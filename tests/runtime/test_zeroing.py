@@ -166,7 +166,7 @@ class TestOnDemand:
         assert event.startswith("sensor 4: zeroing given up, the old baseline stays: taxel (") and why in event
         assert results[-1].baseline.id == BASELINE.id
 
-    def test_one_sensor_alone_or_all(self):
+    def test_one_sensor_alone_or_all_that_have_a_baseline(self):
         bench = make_bench(baselines={"4": BASELINE, "6": BASELINE})
         for sensor in ("4", "6"):
             bench.play(2, sensor=sensor)
@@ -174,8 +174,6 @@ class TestOnDemand:
         assert events(bench.play(105, sensor="4")) == [] and len(events(bench.play(105, sensor="6"))) == 1
         bench.runtime.zero("9")
         assert events(bench.play(1)) == ["zeroing refused: no sensor 9, there are 4, 6"]
-
-    def test_without_a_baseline_there_is_nothing_to_zero_again(self):
         results = zeroed(make_bench(baselines={}), 100)
         assert events(results) == ["sensor 4: no baseline yet, zeroing since the start"]
         assert results[-1].baseline.origin == "start-up"
