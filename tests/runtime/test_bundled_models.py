@@ -103,13 +103,9 @@ def test_the_papers_names_are_the_model_of_several_taps():
         four.run(np.zeros((5, 3, 4, 4), dtype=np.float32))
 
 
-@pytest.fixture
-def small():
-    return frozen().thinned(100)
-
-
 class TestSet:
-    def test_windows_are_newest_first_and_absent_taps_are_zero(self, small):
+    def test_windows_are_newest_first_and_absent_taps_are_zero(self):
+        small = frozen().thinned(100)
         windows, tap = small.windows(4), small.tap[4]
         assert windows.shape == (len(small), 4, 3, 4, 4)
         assert (windows[4, 0] == small.newest[4]).all() and (windows[4, 2] == small.earlier[tap, 1]).all()
@@ -122,8 +118,8 @@ class TestSet:
         assert np.allclose(small.patterns()[4], small.unit_patterns[tap].astype(float) * small.indentation_mm[4])
         assert (small.touching()[4] == small.touched[tap]).all() and small.scale == 10
 
-    def test_a_file_gives_back_the_set_and_a_bad_one_replaces_none(self, small, tmp_path):
-        path = tmp_path / "set.npz"
+    def test_a_file_gives_back_the_set_and_a_bad_one_replaces_none(self, tmp_path):
+        small, path = frozen().thinned(100), tmp_path / "set.npz"
         small.save(path)
         with pytest.raises(FrozenSetError):
             replace(small, full_scale_mm=0.0).save(path)

@@ -84,7 +84,7 @@ def test_outlines_lie_as_far_apart_as_they_were_moved():
         boundary_distance_mm(nothing, np.ones((1, 4, 4), dtype=bool), 0.5, 2.0)
 
 
-def test_regions_lie_around_the_contact():
+def test_regions_around_a_contact_have_half_widths_of_their_own():
     pattern = np.zeros((1, 40, 40), dtype=np.float32)
     pattern[0, 10:20, 10:20] = 0.2
     region = regions(pattern, 0.3, 4)[0]
@@ -95,9 +95,6 @@ def test_regions_lie_around_the_contact():
     for value, name in ((0.1, "inside"), (0, "far")):
         assert (regions(np.full((1, 8, 8), value, dtype=np.float32), 0.3, 2) == REGIONS.index(name)).all()
     assert [near_pixels(scale, 4.7) for scale in (10, 20, 4, 2)] == [4, 9, 2, 1], "two millimetres"
-
-
-def test_half_widths_have_the_factor_of_their_region():
     levels = {"50": [0.5, 0.6, 0.7, 0.8], "90": [1.6, 1.6, 1.6, 1.6]}
     region = np.array([[[0, 1], [2, 3]]])
     deviations = np.full((1, 2, 2), 0.1, dtype=np.float32)

@@ -23,7 +23,6 @@ from firmware_bridge.scans.pad_constants import GAINS
 
 CONTRACT = make_trusted_contract()
 PAD_ROW = CONTRACT.pad_row(None)
-_CONTACTS = 60
 
 
 def make_check(contract=CONTRACT, pad=None) -> PatternCheck:
@@ -154,7 +153,7 @@ class TestSensor:
         def contacts_until(suspected, before, count):
             check = make_check()
             suspected_after([before] * count, check)
-            after = suspected_after([ODD if suspected else GOOD] * _CONTACTS, check, first=count)
+            after = suspected_after([ODD if suspected else GOOD] * 60, check, first=count)
             return after.index(suspected)
 
         assert contacts_until(False, ODD, 1000) == contacts_until(False, ODD, 20) >= 8, "no flicker about one level"
