@@ -104,7 +104,6 @@ def test_another_version_is_named_not_what_it_lacks(version):
         ("pad_inputs", '[["thickness_mm", -4, 1]]', "centre as a pad may have it"),
         ("pad_inputs", '[["poisson", 0.4, 0.1], ["poisson", 0.4, 0.1]]', "no name twice"),
         ("traction_scale", "0", "a whole number from 1 to 256, or null"),
-        ("traction_scale", "true", "a whole number"),
         ("test_error", '{"1": {"psnr_db": 30.1}, "4": 33.2}', "a map from taps to metrics"),
         *(
             ("made_for", text, "a map to two numbers, of names of: thickness_mm, .*, gains_certainty")

@@ -95,7 +95,7 @@ class TestLearner:
         assert np.abs(learner.gains - 1).max() <= BOUND + 1e-9
         assert np.isfinite(learner.gains).all() and np.isfinite(learner.deviations).all()
 
-    def test_contacts_weak_clipped_unexplained_or_repeated_teach_nothing(self):
+    def test_weak_clipped_strange_or_repeated_contacts_teach_nothing(self):
         contact, rng, learner = draw_contacts(1)[0], np.random.default_rng(0), GainLearner(MODEL)
         clipped, strange = contact.copy(), contact.copy()
         clipped[0, 1, 1] = 1400

@@ -166,7 +166,7 @@ def test_a_still_grip_is_inferred_once():
     assert again == [None, 18] and len(model.windows) == 4, "the same touch in the next tap"
 
 
-def test_a_press_that_rises_slowly_is_inferred_again_or_each_scan():
+def test_a_press_that_rises_slowly_is_inferred_again():
     (pad, _), (every, model) = make_pad(), make_pad(options=RuntimeOptions(every_scan=True))
     assert [pad.push(PRESS + 5 * n).reused_from for n in range(9)] == [None, 0, 0, None, 3, 3, None, 6, 6]
     assert all(every.push(PRESS).reused_from is None for _ in range(5)) and len(model.windows) == 5

@@ -147,7 +147,7 @@ class TestWatch:
         counts[:, 1, 2] = np.nan
         assert Pad(Baseline.of("4", counts, 0.0, 100, "start-up")).read(50)[-1] == {6: "unzeroed"}
 
-    def test_neither_a_small_sphere_on_one_taxel_nor_noise_is_a_fault(self):
+    def test_neither_a_small_sphere_nor_noise_is_a_fault(self):
         """The sphere's largest neighbour reads 0.030 of it, simulated."""
         assert not any(Pad().read(3 * FAR_SCANS, pressed(5, 3000, share=0.030)))
         assert not any(Pad(seed=3).read(3000))

@@ -146,7 +146,6 @@ def save_graph(path: Path, nodes: list, contract: Contract, constants: dict, met
 
 
 def tiny_stiffness(pad_row: np.ndarray) -> float:
-    """Return the factor by which the tiny model's outputs are stronger for a pad."""
     return 1 + float(pad_row @ np.arange(1, len(pad_row) + 1))
 
 
@@ -162,7 +161,6 @@ def tiny_pattern(window_units: np.ndarray) -> np.ndarray:
 
 
 def tiny_deviation(pattern: np.ndarray) -> np.ndarray:
-    """Return the tiny model's deviation for its pattern."""
     return TINY_DOUBT * (1 + np.abs(pattern))
 
 
