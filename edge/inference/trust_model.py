@@ -87,9 +87,7 @@ FEATURES: Final = _CELLS + 2 * _DRAG_GRID**2
 class ForwardModel:
     """Operator from pattern and traction to the readings of a 4 x 4 sensor, linear in the pad's constants."""
 
-    operator: NDArray[
-        np.float32
-    ]  # (1 + p, 48, FEATURES), of the middle pad, then the change by one spread of a constant
+    operator: NDArray[np.float32]  # (1 + p, 48, FEATURES), of the middle pad, then the change by a constant's spread
     noise: NDArray[np.float32]  # (3,), deviation of a reading of x, y, z from drift, field and noise
     model_error: NDArray[np.float32]  # (3,), RMS of what the operator leaves of true readings, over their amplitude
 
@@ -176,8 +174,8 @@ def pooling(length: int) -> NDArray[np.float32]:
 QUIET_UNITS: Final = 0.02  # added to a scan's amplitude before the division by it: noise stays small
 _MOST: Final = 12.0  # largest reading over the amplitude; a contact on one taxel alone has 4
 PLACE_MM: Final = 5.0  # unit of a tap's place among features: about a taxel pitch
-ERROR_UNITS: Final = np.array([1.0, 5.0], dtype=np.float32)  # of a pose among features, in [mm] and [deg]
-MOST_ERROR: Final = 5.0  # in this unit: beyond it a pose states nothing
+ERROR_UNITS: Final = np.array([1.0, 5.0], dtype=np.float32)  # of a pose's errors, in [mm] and [deg]: five usual ones
+MOST_ERROR: Final = 5.0  # in these units: beyond it a pose states nothing
 _POSE_FEATURES: Final = 6
 
 

@@ -25,9 +25,7 @@ from firmware_bridge.schedule import SENSOR_SILENT_NS
 class MapState(NamedTuple):
     """State of a map as it is shown."""
 
-    contact: NDArray[
-        np.float32
-    ]  # (H, W), probability of a touch; NaN where nothing came, -1 where only doubted patterns
+    contact: NDArray[np.float32]  # (H, W), probability of a touch; NaN where nothing came, -1 where all was doubted
     pads: Mapping[str, PadPose]  # by sensor
     counts: Mapping[str, int]  # patterns by their fate
     size_mm: float
@@ -52,7 +50,7 @@ class MapSink(Sink):
         origin: SourceKind | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Check that the file can be written, on `close` and at a reset, where later ones are numbered, else SinkError.
+        """Take the file to write on `close` and at a reset, later ones with a number, or raise a SinkError.
 
         `show` is called with the map's state a few times a second and must not wait. `origin` is the kind of source
         that the scans of a recording come from.

@@ -22,8 +22,8 @@ NoteKind = Literal[
 KINDS: Final[frozenset[str]] = frozenset(get_args(EventKind))
 NOTE_KINDS: Final[frozenset[str]] = frozenset(get_args(NoteKind))
 
-# Kinds that say more than their detail.
 _OF_SENSOR = ("rest_level", "baseline_doubted", "gains_learned", "tap_dropped", "tap_without_pose", "tap_out_of_reach")
+# Texts of kinds that say more than their detail.
 _TEXTS: Final = {
     "reset": "earlier taps forgotten",
     "zeroing": "sensor {sensor}: no baseline yet, zeroing since the start",

@@ -316,7 +316,7 @@ class Learn:
             self.waiting = True
 
     def learn(self, dead: NDArray[np.bool_]) -> bool:
-        """Learn from the contact that waits; return whether another pad is in use."""
+        """Learn from the contact that waits; return whether another pad is in use since."""
         learner, check = self._learner, self._check
         self.waiting, self._force_counts = False, 0.0
         learned = learner.learn(self._strongest, dead)

@@ -38,9 +38,8 @@ class Wrench(NamedTuple):
 
     force_n: tuple[float, float, float]
     torque_n_mm: tuple[float, float, float]  # through the middle of the face; the last is the twist
-    centre_of_pressure_mm: (
-        tuple[float, float] | None
-    )  # from the middle: where the z force alone gives the other torques
+    # From the middle of the face: where the z force alone gives the torques about x and y.
+    centre_of_pressure_mm: tuple[float, float] | None
     shear_ratio: float | None  # tangential over normal force, whatever the sensor's counts per newton
 
 
