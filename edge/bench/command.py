@@ -59,10 +59,7 @@ class BenchPage:
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
-    """Measure, show on `out` and write, with progress and warnings on `err`; returns the exit code.
-
-    Raises EdgeError where an input cannot be used or a measurement failed; those so far are written first.
-    """
+    """Measure, show on `out` and write; returns the exit code. Those so far are written before an EdgeError."""
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
     page, command = BenchPage(out, err), options.typed
@@ -74,17 +71,15 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         raise UsageError(f"{where}: cannot be made: {error.strerror}: name a folder to write in") from error
     frozen = load_frozen_set(FROZEN_FILE)
     everyone = chosen(subjects(frozen.scale, options.models, page.warn), options.only)
-    # With fewer p99.9 rests on the longest few.
-    few = "" if options.ticks >= 3000 else " (fewer than 3000: p99.9 and misses mean little)"
     date = datetime.now(UTC).isoformat(timespec="seconds")
     page.say(
         f"# Error against run time\n\n{date}, `{command}`\n\n{this_machine()}. {options.ticks} ticks a row at "
-        f"{RATE_HZ:g} Hz{few}, on one thread, as the program runs."
+        f"{RATE_HZ:g} Hz, on one thread, as the program runs."
     )
     lines: list[dict[str, Any]] = []
     try:
         _errors(everyone, frozen, lines, page)
-        _run_times(everyone, options, lines, page)
+        _run_times(everyone, options.ticks, lines, page)
     except KeyboardInterrupt:
         kept = f": what was measured is in {options.out}" if options.out else ""
         page.warn(f"bench stopped before its end{kept}")
@@ -118,12 +113,7 @@ def _error_cells(error: dict[str, float]) -> tuple[str, ...]:
     )
 
 
-def _run_times(
-    everyone: Sequence[Subject],
-    options: argparse.Namespace,
-    lines: list[dict[str, Any]],
-    page: BenchPage,
-) -> None:
+def _run_times(everyone: Sequence[Subject], ticks: int, lines: list[dict[str, Any]], page: BenchPage) -> None:
     columns = ("method", *(f"back to back {figure}" for figure in _FIGURES.values()))
     columns += (*(f"{RATE_HZ:g} Hz {figure}" for figure in _FIGURES.values()), "missed", "CPU %")
     text = (
@@ -132,7 +122,7 @@ def _run_times(
     )
     page.section("Run time", text, columns)
     for subject in everyone:
-        answer = measured({"subject": subject._asdict(), "rate_hz": RATE_HZ, "ticks": options.ticks})
+        answer = measured({"subject": subject._asdict(), "rate_hz": RATE_HZ, "ticks": ticks})
         paced, both = answer["paced"], {"back_to_back": answer["back_to_back"], "paced": answer["paced"]["times"]}
         cells = [cell for times in both.values() for cell in _percentiles(times)]
         cells += [f"{paced['missed']} of {paced['ticks']}", f"{paced['cpu_percent']:.1f}"]
@@ -147,18 +137,13 @@ def measured(job: dict[str, Any]) -> dict[str, Any]:
     # The child imports the same modules as this process, however they were located.
     script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.timing import main; sys.exit(main())"
     libraries = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM")
-    variables = {f"{library}_THREADS": "1" for library in libraries}
-    command, pipe = [sys.executable, "-c", script], subprocess.PIPE
-    environment = os.environ | variables
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as child:
-        try:
-            output, complaint = child.communicate(json.dumps(job))
-        finally:
-            child.kill()  # after a Ctrl-C, Popen itself would leave it running
-    if child.returncode != 0:
-        last = (complaint.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
+    environment = os.environ | {f"{library}_THREADS": "1" for library in libraries}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, input=json.dumps(job), capture_output=True, text=True, env=environment, check=False)
+    if done.returncode != 0:
+        last = (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
         raise BenchError(f"the run time of {job['subject']['name']} was not measured: {last}")
-    return json.loads(output)
+    return json.loads(done.stdout)
 
 
 def _percentiles(times: dict[str, Any]) -> tuple[str, str, str, str]:

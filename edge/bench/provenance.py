@@ -1,9 +1,7 @@
 """Head of a report: the command, commit and inputs that it was made from, as a block of TOML, and the report's age.
 
-    python -m edge.bench.provenance
-
-prints a line for each report: fresh, or stale and why. A report is stale where an input that it names is gone or has
-changed: a model, a set, or one of the few sources that its maker names. It is a list and not a gate: exit code 0.
+`python -m edge.bench.provenance` prints a line for each report: fresh, or stale, where an input that it names, a model,
+a set or one of the few sources, is gone or has changed.
 """
 
 import argparse
@@ -33,18 +31,14 @@ _BLOCK: Final = re.compile(r"^```toml\n(command = .*?)^```\n", re.DOTALL | re.MU
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Provenance of a report: how it was made, and the hash, or UNKNOWN, of each model or set and each source it is of.
-
-    The tree is "clean" or "changed" since the commit, or a note on the origin of its id; the seed is None where each
-    source has its own.
-    """
+    """Provenance of a report: how it was made, and the hash of each model or set and each source."""
 
     command: str
     date: str
     commit: str
-    tree: str
+    tree: str  # "clean" or "changed" since the commit
     machine: str
-    seed: int | None
+    seed: int | None  # None where each source has its own
     models: dict[str, str]
     sources: dict[str, str]
 
@@ -63,8 +57,6 @@ class Provenance:
         for name, before in {**self.models, **self.sources}.items():
             if not (ROOT / name).exists():
                 yield f"{name} is not here"
-            elif before == UNKNOWN:
-                yield f"of {name} no hash was kept"
             elif file_hash(ROOT / name) != before:
                 yield f"{name} has changed"
 

@@ -1,7 +1,4 @@
-"""Subjects of a bench, methods without a network and models, and their error on the frozen test set.
-
-The error is every metric of a subject, by the number of taps that it gets.
-"""
+"""Subjects of a bench, methods without a network and models, and their error on the frozen test set."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,8 +16,7 @@ from edge.inference.onnx_session import ModelSession
 FROZEN_FILE: Final = BUNDLE_DIR / "frozen.npz"
 CLASSICAL_FILE: Final = BUNDLE_DIR / "classical.npz"
 
-Infer = Callable[[NDArray[np.float32]], object]
-"""Inference on a window (K, 3, rows, cols) in zeroed counts, of as many taps as it takes or more."""
+Infer = Callable[[NDArray[np.float32]], object]  # on a window (K, 3, rows, cols) in zeroed counts
 
 
 class Subject(NamedTuple):
@@ -34,8 +30,7 @@ class Subject(NamedTuple):
 def subjects(scale: int, folder: Path | None, refused: Callable[[str], object]) -> list[Subject]:
     """Return the methods without a network, the bundled models, and the user's own in a folder, named FOLDER/NAME.
 
-    `refused` gets a line for each file in it that is no usable model; `scale` is that of the test set. Raises
-    UsageError where there is no such folder, or no .onnx in it.
+    `refused` gets a line for each file in it that is no usable model; without any a UsageError is raised.
     """
     everyone = [Subject(name, None, scale) for name in fitted_methods(CLASSICAL_FILE, scale)]
     everyone += [Subject(path.stem, str(path)) for path in bundled_models()]
@@ -86,12 +81,7 @@ class ErrorRow(NamedTuple):
 
 
 def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
-    """Yield the error of a classical method with the newest tap, of a model with one tap and with all it takes.
-
-    Raises:
-        ModelError: the model cannot be used, or was made for another scale than the test set.
-        FrozenSetError: the model takes more taps than the test set has.
-    """
+    """Yield the error of a method with the newest tap, of a model with one and with all, or raise an EdgeError."""
 
     def row(
         given: int, patterns: NDArray[np.floating], level: float, half_width_mm: NDArray[np.floating] | None = None

@@ -1,7 +1,4 @@
-"""Run times, back to back and at the sensor's rate, on an injected clock, and the process that they are measured in.
-
-It takes one job as JSON on stdin, and writes the result as JSON on stdout.
-"""
+"""Run times, back to back and at the sensor's rate, and the process that measures them, with JSON on its pipes."""
 
 import json
 import sys
@@ -33,15 +30,12 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Run times at a rate; missed are ticks whose run was not done, or not begun, when the next was due.
-
-    The CPU is of the whole process, in [% of one core].
-    """
+    """Run times at a rate."""
 
     times: Times
     ticks: int
-    missed: int
-    cpu_percent: float
+    missed: int  # ticks whose run was not done, or not begun, when the next was due
+    cpu_percent: float  # of the whole process, of one core
 
 
 def summary(took_ns: Sequence[int]) -> Times:

@@ -10,19 +10,14 @@ from numpy.typing import NDArray
 from edge.errors import EdgeError
 from firmware_bridge.recording.npz_recording import read_npz
 
-CONTACT_LEVEL: Final = 0.5
-"""Share of a pattern's maximum from which a pixel of these methods counts as touched: the edge of a blurred step."""
+CONTACT_LEVEL: Final = 0.5  # share of the maximum from which a pixel is touched: the edge of a blurred step
 
+# Function from newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm].
 Method = Callable[[NDArray[np.floating]], NDArray[np.floating]]
-"""Function from newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm]."""
 
 
 def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
-    """Return the methods by name, with the parameters fitted on training taps, at a scale in pixels per taxel pitch.
-
-    The npz holds bilinear_gain () and bicubic_gain () in mm per count, and linear_map (features, pixels). Raises
-    EdgeError if it cannot be read.
-    """
+    """Return the methods by name, as fitted on training taps, at a scale in pixels per pitch, or raise an EdgeError."""
     try:
         arrays = read_npz(path, ("bilinear_gain", "linear_map", "bicubic_gain"), 1 << 28)
         gain, matrix, cubic_gain = float(arrays["bilinear_gain"]), arrays["linear_map"], float(arrays["bicubic_gain"])
@@ -41,10 +36,7 @@ def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
 
 
 def bilinear(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float64]:
-    """Interpolate taxels (..., rows, cols) to (..., rows*scale, cols*scale).
-
-    A taxel sits in the middle of its scale x scale pixels; outside the outer taxels the value is held.
-    """
+    """Interpolate taxels, each in the middle of its pixels, to (..., rows*scale, cols*scale); outside they are held."""
     rows, cols = taxel_values.shape[-2:]
     return _weights(rows, scale) @ taxel_values @ _weights(cols, scale).T
 
@@ -85,7 +77,7 @@ def fit_gain(interpolated: NDArray[np.floating], truth: NDArray[np.floating]) ->
 def fit_linear_map(
     readings: NDArray[np.floating], patterns: NDArray[np.floating], ridge: float = 1e-4
 ) -> NDArray[np.float32]:
-    """Return the least-squares matrix (features, pixels) with readings (n, features) @ matrix ~ patterns (n, pixels).
+    """Return the matrix of least squares with readings (n, features) @ matrix ~ patterns (n, pixels).
 
     The ridge is the weight of the penalty on the matrix, as a share of the mean feature energy.
     """

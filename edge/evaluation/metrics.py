@@ -1,8 +1,7 @@
-"""Errors of a pattern against its truth; numpy only, used by training and runtime alike.
+"""Errors of a pattern against its truth, by training and runtime alike.
 
 All functions of a full scale take (..., H, W) arrays of one shape and the declared full scale L in the same unit, and
-return one value per pattern, shape (...). Equal maps give an infinite PSNR, an SSIM of 1 and an RMSE of 0, also where
-both are constant or zero.
+return one value per pattern, shape (...). Equal maps are perfect also where they are constant.
 """
 
 from collections.abc import Callable
@@ -44,10 +43,9 @@ def ssim_global(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDAr
 
 
 def ssim(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
-    """Return the structural similarity, mean over 11 x 11 Gaussian windows that lie inside the pattern.
+    """Return the structural similarity, mean over 11 x 11 Gaussian windows, of sigma 1.5, inside the pattern.
 
-    Source: Wang et al. 2004; the same figure as scikit-image with gaussian_weights, sigma 1.5,
-    use_sample_covariance=False and data_range=L.
+    Source: Wang et al. 2004; the same figure as scikit-image.
     """
     a, b = _pair(pattern, truth, full_scale)
     if min(a.shape[-2:]) <= 2 * _WINDOW_RADIUS_PX:
@@ -56,10 +54,7 @@ def ssim(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.
 
 
 def contact_iou(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -> NDArray[np.float64]:
-    """Return overlap over union of the pixels of `touched` and those that truly touch, (..., H, W) bool.
-
-    If both are empty they agree: 1.
-    """
+    """Return overlap over union of the touched pixels and those that truly touch, (..., H, W); 1 if both are empty."""
     contact = _touched(pattern, touching, level)
     union = np.sum(contact | touching, axis=(-2, -1))
     overlap = np.sum(contact & touching, axis=(-2, -1))
@@ -71,8 +66,7 @@ def boundary_distance_mm(
 ) -> NDArray[np.float64]:
     """Return the distance between the outlines of two contacts: pixel of one to nearest of the other, mean of both.
 
-    Takes and returns as `contact_iou`, (n, H, W) and (n,), in [mm]. If both contacts are empty they agree: 0. If only
-    one is, they are the map's diagonal apart.
+    It takes (n, H, W). If both contacts are empty it is 0, if only one is, the map's diagonal.
     """
     contact = _touched(pattern, touching, level)
     distance_px = np.zeros(len(contact))

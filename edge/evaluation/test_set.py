@@ -24,6 +24,7 @@ from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.npz_recording import read_npz
 
+# Type and axes of each array; a letter stands for one length everywhere.
 _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "newest": ("int16", "n3rc"),
     "earlier": ("int16", "tk3rc"),
@@ -36,7 +37,6 @@ _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "angle_deg": ("f", "t"),
     "full_scale_mm": ("f", ""),
 }
-"""Type and axes of each array; a letter stands for one length everywhere."""
 
 
 class FrozenSetError(EdgeError, ValueError):
@@ -71,10 +71,7 @@ class FrozenSet:
         return self.unit_patterns.shape[-1] // self.newest.shape[-1]
 
     def windows(self, taps: int, given: int | None = None) -> NDArray[np.float32]:
-        """Return windows (n, taps, 3, rows, cols) in zeroed counts, the newest `given` taps as read, the rest zero.
-
-        Raises FrozenSetError if the set has fewer taps.
-        """
+        """Return windows (n, taps, 3, rows, cols) in zeroed counts, the newest `given` taps as read, the rest zero."""
         if not 1 <= taps <= 1 + self.earlier.shape[1]:
             raise FrozenSetError(
                 f"windows of {taps} taps asked for, the frozen test set has {1 + self.earlier.shape[1]}: make it again "
@@ -115,7 +112,10 @@ def load_frozen_set(path: Path) -> FrozenSet:
     """Load a frozen test set; raises FrozenSetError, which names what is missing, or of another type or shape."""
     try:
         arrays = read_npz(path, _AXES, 1 << 31)
-        _check_axes(arrays)
+        lengths = check_axes(_AXES, arrays)
+        taps = arrays["tap"]
+        if not taps.size or taps.min() < 0 or taps.max() >= lengths["t"] or not 0 < arrays["full_scale_mm"] < np.inf:
+            raise ValueError("array 'tap' names taps that are not there, or 'full_scale_mm' is not a length")
     except (OSError, ValueError) as error:
         raise FrozenSetError(
             f"{path} is not a frozen test set ({error}): make it with 'python -m train.freeze'"
@@ -140,13 +140,6 @@ def check_axes(axes_of: Mapping[str, tuple[str, str]], arrays: Mapping[str, NDAr
     return lengths
 
 
-def _check_axes(arrays: Mapping[str, NDArray[Any]]) -> None:
-    lengths = check_axes(_AXES, arrays)
-    taps = arrays["tap"]
-    if not taps.size or taps.min() < 0 or taps.max() >= lengths["t"] or not 0 < arrays["full_scale_mm"] < np.inf:
-        raise ValueError("array 'tap' names taps that are not there, or 'full_scale_mm' is not a length")
-
-
 def judge(
     patterns: NDArray[np.floating],
     frozen: FrozenSet,
@@ -154,11 +147,7 @@ def judge(
     half_width_mm: NDArray[np.floating] | None = None,
     pitch_mm: float = USPA44.pitch_mm,
 ) -> dict[str, NDArray[np.float64]]:
-    """Return every metric of every frame, (n,) each, of patterns (n, H, W) in [mm].
-
-    A pixel counts as touched from `contact_level`, a share of its pattern's maximum. Without the half widths of the
-    90 % intervals, (n, H, W), "coverage_90" is left out.
-    """
+    """Return every metric of every frame, (n,) each, of patterns and half widths of 90 % intervals (n, H, W)."""
     truth, full_scale = frozen.patterns(), frozen.full_scale_mm
     errors = {
         "psnr_db": psnr_db(patterns, truth, full_scale),
@@ -174,7 +163,7 @@ def judge(
 
 
 def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> dict[str, NDArray[np.float64]]:
-    """Return every metric of every frame, (n,) each, of a model with the newest `given` taps or all that it takes."""
+    """Return every metric of every frame of a model with the newest `given` taps, or all that it takes."""
     patterns, half_width_mm = infer_with_intervals(model, frozen, given)
     return judge(patterns, frozen, model.contract.contact_level, half_width_mm, model.contract.pitch_mm)
 
@@ -182,10 +171,7 @@ def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> di
 def infer_with_intervals(
     model: Model, frozen: FrozenSet, given: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Return the patterns (n, H, W) of every frame, and the half widths of their 90 % intervals, both in [mm].
-
-    The intervals are None if the model gives no deviations.
-    """
+    """Return the patterns (n, H, W) of every frame, and the half widths of their 90 % intervals, None without."""
     contract = model.contract
     patterns: list[NDArray[np.float32]] = []
     half_widths_mm: list[NDArray[np.float32]] = []

@@ -8,13 +8,11 @@ from edge.errors import ModelError, UsageError
 
 BUNDLE_DIR: Final = Path(__file__).resolve().parents[1] / "models"
 TAXELS: Final = BUNDLE_DIR / "taxels.npz"  # file of the estimator of dead taxels
-CONTACTS: Final = BUNDLE_DIR / "contacts.npz"
-"""File of the distribution of contacts by which a running sensor learns its gains."""
+CONTACTS: Final = BUNDLE_DIR / "contacts.npz"  # distribution of contacts, by which a running sensor learns its gains
 DEFAULT_MODEL: Final = "stsr-int8"  # model that assumes nothing of earlier taps
 INT8_SUFFIX: Final = "-int8"
 POSED_MODEL: Final = "mtsr-int8"  # default where poses of the pad come: it combines up to 7 taps
-_OF_TAPS: Final = re.compile(r"(?<=^mtsr)[2-7](?=-int8$|$)")
-"""Number of taps in the paper's names: mtsr4 is mtsr, given four taps at most."""
+_OF_TAPS: Final = re.compile(r"(?<=^mtsr)[2-7](?=-int8$|$)")  # mtsr4, a name of the paper's, is mtsr given four taps
 
 
 def bundled_models() -> list[Path]:
@@ -23,13 +21,10 @@ def bundled_models() -> list[Path]:
 
 
 def find_model(name: str | Path) -> Path:
-    """Return the file of a model: a path, or a bundled name, with or without .onnx.
+    """Return the file of a model, a path or a bundled name, with or without .onnx, or raise a ModelError.
 
     A name without its precision is the best file there is: that in float32, or where an installation lacks it, such as
-    the wheel, that in 8-bit integers. The names mtsr2 to mtsr7 mean the file mtsr, see `taps_of`.
-
-    Raises:
-        ModelError: there is none; the message lists the bundled ones.
+    the wheel, that in 8-bit integers. The names mtsr2 to mtsr7 mean the file mtsr.
     """
     path = Path(name)
     if path.is_file():
@@ -45,7 +40,7 @@ def find_model(name: str | Path) -> Path:
 
 
 def taps_of(name: str | Path) -> int | None:
-    """Return the number of taps that a bundled name states and its file does not: 4 of mtsr4; None of all others."""
+    """Return the number of taps that a bundled name states and its file does not, as mtsr4 does; else None."""
     stated = _OF_TAPS.search(_stem(name))
     return int(stated[0]) if stated and not _OF_TAPS.search(find_model(name).stem) else None
 
@@ -55,12 +50,12 @@ def _stem(name: str | Path) -> str:
 
 
 def demo_recording() -> Path:
-    """Return the file of the recording that the demo plays; UsageError if it is missing from this installation."""
+    """Return the file of the recording that the demo plays, or raise a UsageError."""
     return _installed("demo.npz")
 
 
 def example_recording() -> Path:
-    """Return the file of a recording of two emulated fingers that grip things; UsageError if it is missing."""
+    """Return the file of a recording of two emulated fingers that grip things, or raise a UsageError."""
     return _installed("grip.npz")
 
 

@@ -25,36 +25,25 @@ POSES_NAME: Final = "poses"
 OUTPUT_NAME: Final = "pattern"
 DEVIATION_NAME: Final = "deviation"
 TRACTION_NAME: Final = "traction"
-ANY_BATCH: Final = "any"
-"""Name of the first dimension of every input and output: a graph takes any number of windows in one run."""
-ANY_TAPS: Final = "taps"
-"""Name of the second dimension of window and poses of a graph that takes poses: 1 to K taps in one run."""
+ANY_BATCH: Final = "any"  # first dimension of every input and output: any number of windows in one run
+ANY_TAPS: Final = "taps"  # second dimension of window and poses of a graph that takes poses: 1 to K taps in one run
 ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
 MOST: Final = MappingProxyType({"taps": 64, "scale": 256, "rows": 64, "cols": 64})
 MOST_PIXELS: Final = 1 << 20
-LONGEST_VALUE: Final = 1 << 20
-"""Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
+LONGEST_VALUE: Final = 1 << 20  # most characters of a key's JSON; `trust` of a bundled model has a quarter of them
 LONGEST_SHOWN: Final = 100
 GAINS_CERTAINTY: Final = "gains_certainty"
 POSE_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg", "error_mm", "error_deg")  # of a row; the newest tap has zeros
 POSE_WIDTH: Final = len(POSE_KEYS)
 LEAST_UNIT: Final = 1e-6  # least divisor in counts, newtons or millimetres, so that float32 holds the quotient
 
-Shape = tuple[Any, ...]
-"""Shape of an input or output, the batch first: a number for each dimension, or a name where it is free."""
+Shape = tuple[Any, ...]  # of an input or output: a number for each dimension, or a name where it is free
 
 
 @dataclass(frozen=True, slots=True)
 class Contract:
-    """Inputs, outputs and measured errors of a model; "The contract in a model" of docs/formats.md has each key.
-
-    Attributes:
-        confidence: number of taps -> table as edge.inference.intervals takes it.
-        test_error: number of taps -> metric name -> value; empty if the test set has another scale.
-        trust: as edge.inference.trust_model reads it; empty if the model has no checks.
-        interval_levels: percentage -> deviations for each of edge.inference.intervals.REGIONS; empty if not measured.
-    """
+    """Inputs, outputs and measured errors of a model; "The contract in a model" of docs/formats.md has each key."""
 
     version: int
     taps: int
@@ -71,15 +60,15 @@ class Contract:
     pitch_mm: float
     arithmetic: str
     interval_factor: float | None
-    confidence: dict[str, dict[str, list[float]]]
+    confidence: dict[str, dict[str, list[float]]]  # number of taps -> table as edge.inference.intervals takes it
     training_sha256: str
     test_set_sha256: str
-    test_error: dict[str, dict[str, float]]
+    test_error: dict[str, dict[str, float]]  # number of taps -> metric; empty if the test set has another scale
     pad_inputs: tuple[tuple[str, float, float], ...] = ()
     takes_gains: bool = False
     traction_scale: int | None = None
-    trust: dict[str, Any] = field(default_factory=dict)
-    interval_levels: dict[str, list[float]] = field(default_factory=dict)
+    trust: dict[str, Any] = field(default_factory=dict)  # as edge.inference.trust_model reads it
+    interval_levels: dict[str, list[float]] = field(default_factory=dict)  # percentage -> deviations for each region
     takes_poses: bool = False
     reach_mm: float = 0.0
     unposed_taps: int = 1
@@ -87,10 +76,7 @@ class Contract:
 
     @property
     def window_shape(self) -> Shape:
-        """Shape of the window: (any, 3 taps, rows, cols), a tap's x, y, z side by side.
-
-        With poses it is (any, taps, 3, rows, cols), of as many taps as there are.
-        """
+        """Shape of the window: a tap's x, y, z side by side; with poses (any, taps, 3, rows, cols)."""
         if self.takes_poses:
             return (ANY_BATCH, ANY_TAPS, len(AXES), self.rows, self.cols)
         return (ANY_BATCH, 3 * self.taps, self.rows, self.cols)
@@ -118,7 +104,7 @@ class Contract:
 
     @property
     def input_shapes(self) -> dict[str, Shape]:
-        """Shapes of the graph's inputs by name: the window, and the poses and the pad if the model takes them."""
+        """Shapes of the graph's inputs by name."""
         shapes: dict[str, Shape] = {INPUT_NAME: self.window_shape}
         if self.takes_poses:
             shapes[POSES_NAME] = (ANY_BATCH, ANY_TAPS, POSE_WIDTH)
@@ -128,7 +114,7 @@ class Contract:
 
     @property
     def output_shapes(self) -> dict[str, Shape]:
-        """Shapes of the graph's outputs by name: the pattern, and its deviation and the traction if there are any."""
+        """Shapes of the graph's outputs by name."""
         shapes: dict[str, Shape] = {OUTPUT_NAME: (ANY_BATCH, *self.pattern_shape)}
         if self.interval_factor is not None:
             shapes[DEVIATION_NAME] = (ANY_BATCH, *self.pattern_shape)
@@ -142,11 +128,7 @@ class Contract:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> "Contract":
-        """Read and check a contract of this version.
-
-        Raises:
-            ModelError: a key is missing, unreadable or out of range; the key is named.
-        """
+        """Read and check a contract of this version, or raise a ModelError that names the key."""
         version = _value(metadata, "version")
         # Before the other keys, which another version may lack.
         if type(version) is not int or version != CONTRACT_VERSION:
@@ -160,18 +142,9 @@ class Contract:
         return cls(**values)
 
     def check_sensor(self, geometry: SensorGeometry) -> None:
-        """Refuse a sensor that the model was not trained for.
-
-        Raises:
-            ModelError: a key of the contract differs from the sensor's; the message names it.
-        """
-        for key, got in (
-            ("sensor", geometry.name),
-            ("rows", geometry.rows),
-            ("cols", geometry.cols),
-            ("pitch_mm", geometry.pitch_mm),
-        ):
-            expected = getattr(self, key)
+        """Raise a ModelError, which names the key, for a sensor that the model was not trained for."""
+        for key, name in (("sensor", "name"), ("rows", "rows"), ("cols", "cols"), ("pitch_mm", "pitch_mm")):
+            expected, got = getattr(self, key), getattr(geometry, name)
             if got != expected:
                 raise ModelError(
                     f"contract key '{key}' is {expected!r}, but the sensor's is {got!r}: the model is for a "
@@ -191,12 +164,10 @@ class Contract:
         return deformation_counts / (divisor if gains is None else divisor * gains)
 
     def pad_row(self, pad: Pad | None) -> NDArray[np.float32]:
-        """Return a pad as model input.
+        """Return a pad as model input (pad_width,); a constant whose interval is wide counts as unknown.
 
-        Returns:
-            (pad_width,) float32: for each of `pad_inputs` (value - centre) / spread, 0 if unknown; then 1 for each that
-            is available and 0 for each that is not; last, if the model takes gains, their certainty, 0 without gains. A
-            constant whose interval is wide counts as unknown.
+        It has for each of `pad_inputs` (value - centre) / spread, 0 if unknown; then 1 for each that is known, else 0;
+        last, if the model takes gains, their certainty.
         """
         row = np.zeros(self.pad_width, dtype=np.float32)
         if pad is None:
@@ -213,10 +184,7 @@ class Contract:
         return row
 
     def is_outside(self, pad: Pad | None) -> bool:
-        """Return whether a constant of a pad that the model takes is far outside of its range in training.
-
-        Where it has an interval, the whole interval must be. Of a model for one sensor any other pad is outside.
-        """
+        """Return whether a constant that the model takes, or its whole interval, is far outside the training."""
         constants = {} if pad is None else pad.constants | {GAINS_CERTAINTY: pad.gains_certainty}
         for name, (least, most) in self.made_for.items():
             low, high = (constants.get(name, math.nan),) * 2
@@ -266,7 +234,7 @@ def _check(values: Mapping[str, Any]) -> None:
 
 
 def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
-    """Yield a key, whether its value is lawful, and the expected value; a rule may rely on those before it."""
+    """Yield a key, whether its value is lawful, and what is expected; a rule may rely on those before it."""
     for key, most in MOST.items():
         yield key, _is_whole(values[key], most), f"a whole number from 1 to {most}"
     taxels = values["rows"] * values["cols"]
@@ -355,7 +323,7 @@ def scheduled_rows(taps: int, angle_step_deg: float) -> NDArray[np.float32]:
 
 
 class Model(Protocol):
-    """Model that is ready to run."""
+    """Model that is ready to run: a session, or a user's own."""
 
     name: str
     contract: Contract
@@ -380,10 +348,10 @@ class Model(Protocol):
 
     @property
     def deviation(self) -> NDArray[np.float32] | None:
-        """Standard deviation of each pixel of the last run's patterns, of their shape; None without."""
+        """Standard deviation of each pixel of the last run's patterns, of their shape."""
         ...
 
     @property
     def traction(self) -> NDArray[np.float32] | None:
-        """Traction (3, h, w) of the last run, (n, 3, h, w) of several windows, in [kPa]; None without."""
+        """Traction (3, h, w) of the last run, (n, 3, h, w) of several windows, in [kPa]."""
         ...

@@ -1,11 +1,8 @@
 """Intervals of a pattern's pixels, the expected error of all of it, and the expected gain of another tap.
 
 Deviations are calibrated so that `interval_factor` of them holds 90 % of the pixels in every region. Errors around a
-contact have longer tails than those in it, so other levels have a factor of their own in each region.
-
-A pattern's doubt is the RMS of its deviations over the RMS of the pattern itself, one number. A table in the model's
-contract gives its meaning on taps not trained on, by the number of taps in the window: the error that patterns of that
-doubt had, and the share of it that one more tap took away.
+contact have longer tails than those in it, so other levels have a factor of their own in each region. A pattern's doubt
+is the RMS of its deviations over the RMS of the pattern itself; a table in the model's contract tells what it means.
 """
 
 import math
@@ -16,10 +13,8 @@ from typing import Any, Final, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-REGIONS: Final = ("inside", "edge", "near", "far")
-"""Regions of a pattern: inside the contact, the pixels on both sides of its outline, up to NEAR_MM outside, the
-rest."""
-NEAR_MM: Final = 2.0
+REGIONS: Final = ("inside", "edge", "near", "far")  # the edge has pixels on both sides of the outline
+NEAR_MM: Final = 2.0  # from the contact
 
 
 def near_pixels(scale: int, pitch_mm: float) -> int:
@@ -28,10 +23,7 @@ def near_pixels(scale: int, pitch_mm: float) -> int:
 
 
 def regions(patterns: NDArray[np.floating], contact_level: float, near: int) -> NDArray[np.int8]:
-    """Return each pixel's region as an index of REGIONS, (n, H, W), of patterns (n, H, W).
-
-    A pixel from `contact_level` of its pattern's maximum is touched; `near` pixels from the contact are near it.
-    """
+    """Return each pixel's region as an index of REGIONS, (n, H, W); `near` pixels from the contact are near it."""
     touched = patterns > np.float32(contact_level) * patterns.max(axis=(1, 2), keepdims=True)
     inside, edge = ~_grown(~touched, 1), _grown(touched, 1)
     return np.select([inside, edge, _grown(touched, near)], [0, 1, 2], 3).astype(np.int8)
@@ -43,10 +35,7 @@ def half_widths_mm(
     deviations: NDArray[np.floating],
     region: NDArray[np.integer],
 ) -> NDArray[np.floating]:
-    """Return half widths (n, H, W) in [mm] of the intervals that hold so many percent of the pixels in each region.
-
-    `levels` are the contract's `interval_levels`, of which `percent` is a key; deviations are (n, H, W) in [mm].
-    """
+    """Return half widths (n, H, W) of the intervals of so many percent, a key of the contract's `interval_levels`."""
     return deviations * np.asarray(levels[percent], dtype=np.float32)[region]
 
 
@@ -64,13 +53,12 @@ def _grown(masks: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     return grown
 
 
-LARGEST: Final = float(np.finfo(np.float32).max)
-"""Largest number in a contract: patterns are float32. A whole number can have more digits than any float."""
+LARGEST: Final = float(np.finfo(np.float32).max)  # in a contract; a whole number can have more digits than any float
 WORTH_A_TAP: Final = 0.02  # share of the error that another tap must be expected to take away to be worth it: 0.2 dB
 
+# Number of taps -> doubt, error and gain, lists of one length, on taps not trained on: at that doubt, the RMS error as
+# a share of the pattern's RMS, and the share of it that another tap takes away; no gain for the largest number of taps.
 Table = Mapping[str, Mapping[str, list[float]]]
-"""Number of taps -> doubt, error and gain, lists of one length: at that doubt, the RMS error as a share of the
-pattern's RMS, and the share of the error that another tap takes away; no gain for the largest number of taps."""
 
 
 def doubt(pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> tuple[float, float]:
@@ -81,11 +69,10 @@ def doubt(pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> tuple
 
 
 def expect(table: Table, taps: int, about: float, size: float) -> tuple[float, bool | None] | None:
-    """Return the expected RMS error of a pattern of so many taps, and whether another tap is worth it.
+    """Return the expected RMS error of a pattern of so many taps, of a doubt and an RMS, and if another is worth it.
 
-    The pattern's doubt and RMS are as `doubt` gives them, and the error is in the pattern's unit; no other tap is known
-    of where the network takes none. Between two doubts of the table it is interpolated, beyond the last the error grows
-    with the doubt. None if the table has none, and for a pattern of zeros.
+    Beyond the last doubt of the table the error grows with the doubt. None for a number of taps that the table has not,
+    and for a pattern of zeros.
     """
     row = table.get(str(taps))
     if row is None or size == 0:

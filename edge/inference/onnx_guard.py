@@ -1,8 +1,7 @@
 """Guard of loading a model: its file is one plain graph with its own weights, of bounded size.
 
 onnxruntime follows a tensor into a side file, and a graph into graphs within it, which may run for ever. The walk
-covers the fields that lead to them and to the operators, skips all else, and refuses what it does not understand.
-Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
+covers the fields that lead to them and to the operators. Source: onnx.proto, IR version 10 to 13; Protocol Buffers.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,8 +24,7 @@ Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin ReduceSum ReduceSumSquare Rel
 Sigmoid Sign Sin Slice Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze Sub Sum Tanh Tile Transpose Unsqueeze
 Where
 """
-OPERATORS: Final = frozenset(_NAMES.split())
-"""Operators that are allowed, as docs/formats.md lists them: no loop, no recurrence, nothing random, no text."""
+OPERATORS: Final = frozenset(_NAMES.split())  # as docs/formats.md lists them: no loop, nothing random, no text
 _VARINT_BYTES: Final = 10
 _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 _FIXED_BYTES: Final = {_FIXED64: 8, _FIXED32: 4}
@@ -58,11 +56,7 @@ class _Field(NamedTuple):
 
 
 def read_model(path: Path) -> bytes:
-    """Return an ONNX file's content, for onnxruntime to load from memory.
-
-    Raises:
-        ModelError: the file is missing, too large, or not one plain graph with its weights.
-    """
+    """Return an ONNX file's content, for onnxruntime to load from memory, or raise a ModelError."""
     try:
         content = read_bounded(path, MOST_BYTES)
     except OSError as error:
@@ -75,12 +69,7 @@ def read_model(path: Path) -> bytes:
 
 
 def check_plain(content: bytes) -> None:
-    """Refuse all files but one plain graph with its weights.
-
-    Raises:
-        ModelError: weights in another file, or sparse; graphs within the graph; an operator that is not one of
-            OPERATORS, or too many; or not the encoding that ONNX has.
-    """
+    """Raise a ModelError for all files but one plain graph of OPERATORS with its weights."""
     waiting: list[tuple[_Message, int, int]] = [(_MODEL, 0, len(content))]
     fields = nodes = 0
     while waiting:
@@ -99,16 +88,12 @@ def check_plain(content: bytes) -> None:
                 waiting.append((kind, field.start, field.end))
             if message is _TENSOR and field.number == _LOCATION and (field.wire != _VARINT or field.value):
                 raise ModelError(_SIDE_FILE)
-            if message is _NODE and field.number in (_OPERATOR, _DOMAIN):
-                _check_operator(field.number, content[field.start : field.end])
-
-
-def _check_operator(field: int, name: bytes) -> None:
-    text = name[:40].decode(errors="replace")
-    if field == _OPERATOR and text not in OPERATORS:
-        raise ModelError(f"has operator {text!r}, expected only those that docs/formats.md lists")
-    if field == _DOMAIN and text not in ("", "ai.onnx"):
-        raise ModelError(f"has an operator of domain {text!r}, expected ONNX's own alone")
+            if message is _NODE:
+                text = content[field.start : field.end][:40].decode(errors="replace")
+                if field.number == _OPERATOR and text not in OPERATORS:
+                    raise ModelError(f"has operator {text!r}, expected only those that docs/formats.md lists")
+                if field.number == _DOMAIN and text not in ("", "ai.onnx"):
+                    raise ModelError(f"has an operator of domain {text!r}, expected ONNX's own alone")
 
 
 def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:

@@ -32,8 +32,7 @@ LOG_FATAL_ONLY: Final = 4
 LONGEST_REASON: Final = 300
 _PLACE: Final = re.compile(
     r"/\S+\.(?:cc|cpp|h):\d+ [\w:~<>]+(?: [\w:~<>&*]+)*\([^()]*(?:\([^()]*\)[^()]*)*\)(?: const)? "
-)
-"""Pattern of a function's file, line and signature."""
+)  # a function's file, line and signature
 ORT_ERRORS: Final = (
     ort_errors.EPFail,
     ort_errors.Fail,
@@ -52,27 +51,16 @@ onnxruntime.disable_telemetry_events()  # if it was imported before `edge`, whic
 
 
 class ModelSession:
-    """Model ready to run, on one thread by default, without spinning.
+    """Model ready to run, on one thread without spinning."""
 
-    Attributes:
-        name: of the model.
-        contract: of the model.
-        deviation: of each pixel of the last run, (H, W) float32 above zero, or (n, H, W) after n windows were run
-            together; None without.
-        traction: of the last run, (3, h, w) or (n, 3, h, w) float32 in [kPa], as `deviation`.
-    """
-
-    def __init__(self, path: Path, threads: int = 1, *, taps: int | None = None) -> None:
-        """Load, check and warm up; `threads` share the work of one run.
+    def __init__(self, path: Path, *, taps: int | None = None) -> None:
+        """Load, check and warm up, or raise a ModelError where the file is no model that keeps its contract.
 
         `taps` are the most that are given to a model that takes more, with poses; the name then states them.
-
-        Raises:
-            ModelError: the file is no model that is allowed, or its graph does not keep its contract.
         """
         self._path = path
         self.name = harmless(path.stem, kept="")
-        self._session = load_session(path, threads)
+        self._session = load_session(path)
         try:
             self.contract = Contract.from_metadata(self._session.get_modelmeta().custom_metadata_map)
             _check_tensors("input", self._session.get_inputs(), self.contract.input_shapes)
@@ -102,22 +90,11 @@ class ModelSession:
         pad: NDArray[np.float32] | None = None,
         poses: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Infer the pattern of one window.
+        """Return the pattern (H, W) of a window (taps, 3, rows, cols) in network input units, newest tap first.
 
-        Args:
-            window: (taps, 3, rows, cols) float32, newest first, in network input units; 1 to K taps of a model that
-                takes poses, else K.
-            pad: the contract's `pad_row` of the sensor's pad; by default that of an unknown pad.
-            poses: (taps, 5) float32 as edge.inference.contract makes them, for a model that takes poses; by default
-                those of the paper's schedule, and zeros for taps of zeros.
-
-        Returns:
-            (H, W) float32 in the contract's output unit.
-
-        Raises:
-            WindowError: wrong shape or type, or not finite.
-            ModelError: the model cannot be run on it, or gave a pattern or a traction that is not finite, or a
-                deviation that is not finite and above zero.
+        A model that takes poses (taps, 5) takes 1 to K taps, by default at those of the paper's schedule, with zeros
+        for taps of zeros; any other takes K. The pad is the contract's `pad_row`, by default of an unknown one. Raises
+        WindowError for a wrong shape or type or what is not finite, and ModelError where the model fails on it.
         """
         pads, rows = None if pad is None else [pad], None if poses is None else [poses]
         pattern = self.run_together([window], pads, rows)[0]
@@ -133,10 +110,7 @@ class ModelSession:
         pads: Sequence[NDArray[np.float32]] | None = None,
         poses: Sequence[NDArray[np.float32]] | None = None,
     ) -> NDArray[np.float32]:
-        """Infer the patterns (n, H, W) of several windows, of different sensors, in one call; see `run`.
-
-        With poses, windows may have different numbers of taps.
-        """
+        """Return the patterns (n, H, W) of several windows, with poses of different numbers of taps; see `run`."""
         for window in windows:
             self._check_window(window)
         pads = [self._unknown_pad] * len(windows) if pads is None else pads
@@ -147,14 +121,13 @@ class ModelSession:
         feeds: dict[str, NDArray[np.float32]] = {}
         if self.contract.takes_poses:
             poses = [self._scheduled(window) for window in windows] if poses is None else poses
-            taps = max(map(_present, windows))
+            taps = max(map(len, windows))
             feeds[INPUT_NAME] = np.zeros((len(windows), taps, *self._shape[1:]), dtype=np.float32)
             feeds[POSES_NAME] = np.zeros((len(windows), taps, POSE_WIDTH), dtype=np.float32)
             for index, (window, rows) in enumerate(zip(windows, poses, strict=True)):
                 _check_poses(rows, len(window))
-                present = _present(window)
-                feeds[INPUT_NAME][index, :present] = window[:present]
-                feeds[POSES_NAME][index, :present] = rows[:present]
+                feeds[INPUT_NAME][index, : len(window)] = window
+                feeds[POSES_NAME][index, : len(window)] = rows
         elif poses is not None:
             raise WindowError(f"poses are given, but model '{self.name}' takes none: leave them out")
         else:
@@ -196,14 +169,6 @@ class ModelSession:
         return rows
 
 
-def _present(window: NDArray[np.float32]) -> int:
-    """Return the number of taps of a window up to its last one that is not all zeros, at least 1."""
-    taps = len(window)
-    while taps > 1 and not window[taps - 1].any():
-        taps -= 1
-    return taps
-
-
 def _check_poses(poses: NDArray[np.float32], taps: int) -> None:
     if poses.shape != (taps, POSE_WIDTH) or poses.dtype != np.float32:
         expected = f"({taps}, {POSE_WIDTH}) float32: {', '.join(POSE_KEYS)} of each tap of the window"
@@ -216,13 +181,12 @@ def _check_poses(poses: NDArray[np.float32], taps: int) -> None:
         )
 
 
-def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
+def session_options() -> onnxruntime.SessionOptions:
     """Return the session options of the runtime."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = LOG_FATAL_ONLY
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     # A second lock after `read_model`. No file can lie below the null device; and without the format a file might be
@@ -232,19 +196,15 @@ def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
     return options
 
 
-def load_session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
-    """Load any ONNX file with the runtime's session options, without looking for a contract.
-
-    Raises:
-        ModelError: the file is missing, not a model, or not one plain graph with its weights.
-    """
+def load_session(path: Path) -> onnxruntime.InferenceSession:
+    """Load any ONNX file with the runtime's session options, without a contract, or raise a ModelError."""
     content = read_model(path)
     try:
         # The fallback would try the same again, and print on stdout, where records go. In a stranger's file the folding
         # of constants can last hours.
         return onnxruntime.InferenceSession(
             content,
-            session_options(threads),
+            session_options(),
             providers=["CPUExecutionProvider"],
             enable_fallback=0,
             disabled_optimizers=["ConstantFolding"],

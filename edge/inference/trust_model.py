@@ -1,9 +1,8 @@
 """Forward model and checks that a model brings along, by which `edge.perception.trust_check` decides what to believe.
 
-Two small networks tell whether any contact reads like that, by features that training and runtime make here. They do
-not depend on the force but for its size. The forward model gives the readings that a pattern makes: it explains a
-contact only in part, because pads, gains and large deformations differ; what it leaves is weighed by that. All of it is
-made by train.trust, in network units, and travels in a model's contract.
+Two small networks tell whether any contact reads like that, by features that training and runtime make here. The
+forward model gives the readings that a pattern makes: it explains a contact only in part, because pads, gains and large
+deformations differ; what it leaves is weighed by that. train.trust makes all of it, in network units.
 """
 
 import base64
@@ -20,11 +19,7 @@ from firmware_bridge.pad_geometry import AXES
 
 
 class SmallNetwork:
-    """Layers of weights (outputs, inputs) and offsets (outputs,), rectified, from a row of features to one number.
-
-    Raises:
-        ValueError: layers that do not follow each other, or do not end in one number.
-    """
+    """Layers of weights (outputs, inputs) and offsets (outputs,), rectified, from a row of features to one number."""
 
     def __init__(self, layers: Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]) -> None:
         width = layers[0][0].shape[-1]
@@ -55,22 +50,22 @@ class SmallNetwork:
 
 
 def small_network(value: Any) -> SmallNetwork:
-    """Return the network of a value that `SmallNetwork.to_json` has made; raises one of DAMAGE if it is none."""
+    """Return the network of `SmallNetwork.to_json`, or raise one of DAMAGE."""
     return SmallNetwork([(unpacked(layer["weights"]), unpacked(layer["offsets"])) for layer in value])
 
 
+# Errors of reading what is no packed array, network or model.
 DAMAGE: Final = (TypeError, KeyError, IndexError, ValueError, OverflowError, AttributeError)
-"""Errors of reading what is no packed array, network or model."""
 
 
 def packed(values: NDArray[np.floating]) -> dict[str, Any]:
-    """Return an array as JSON: its shape, and its numbers in half precision as base64."""
+    """Return an array as JSON: shape, and numbers in half precision as base64."""
     half = np.ascontiguousarray(values, dtype="<f2")
     return {"shape": list(half.shape), "f2": base64.b64encode(half.tobytes()).decode()}
 
 
 def unpacked(value: Any) -> NDArray[np.float32]:
-    """Return the array of a value that `packed` has made; raises one of DAMAGE if it is none."""
+    """Return the array of `packed`, or raise one of DAMAGE."""
     shape = [int(length) for length in value["shape"]]
     content = base64.b64decode(value["f2"], validate=True)
     if not all(length > 0 for length in shape) or len(content) != 2 * math.prod(shape):
@@ -81,28 +76,20 @@ def unpacked(value: Any) -> NDArray[np.float32]:
     return values
 
 
-GRID: Final = 8
-"""Cells of the pattern along a side: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
+GRID: Final = 8  # cells of the pattern along a side: a wave finer than two loses 97 % of its amplitude in the pad
 _CELLS: Final = GRID**2
 KPA: Final = 30.0  # tangential traction that counts as 1, in [kPa]
-_DRAG_GRID: Final = 4
-"""Cells of the drag along a side in the contract; the traction has twice as many, and four of them share a weight."""
+_DRAG_GRID: Final = 4  # cells of the drag along a side; the traction has twice as many, four of which share a weight
 FEATURES: Final = _CELLS + 2 * _DRAG_GRID**2
 
 
 @dataclass(frozen=True)
 class ForwardModel:
-    """Operator from pattern and traction to the readings of a 4 x 4 sensor, linear in the pad's constants.
+    """Operator from pattern and traction to the readings of a 4 x 4 sensor, linear in the pad's constants."""
 
-    Attributes:
-        operator: (1 + p, 48, FEATURES), of the middle pad, then the change by one spread of each constant.
-        noise: (3,), deviation of a reading of x, y, z from drift, field and noise.
-        model_error: (3,), RMS of what the operator leaves of true patterns' readings, over their amplitude.
-    """
-
-    operator: NDArray[np.float32]
-    noise: NDArray[np.float32]
-    model_error: NDArray[np.float32]
+    operator: NDArray[np.float32]  # (1 + p, 48, FEATURES), of the middle pad, then the change by a constant's spread
+    noise: NDArray[np.float32]  # (3,), deviation of a reading of x, y, z from drift, field and noise
+    model_error: NDArray[np.float32]  # (3,), RMS of what the operator leaves of true readings, over their amplitude
 
     def of_pad(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the operator of a pad for `features`, by its constants (p,) over their spread, 0 where unknown."""
@@ -121,9 +108,7 @@ class ForwardModel:
     ) -> float:
         """Return the share of the energy of a tap's readings that its pattern leaves unexplained.
 
-        Readings (3, rows, cols) in network units count less where noise, drift, the operator of the pad itself, and the
-        standard deviation that remains of the gains make them uncertain. Pattern (H, W) in [mm], traction (3, h, w) in
-        [kPa].
+        Readings count less where noise, drift, the operator, and what remains of the gains make them uncertain.
         """
         readings, z = tap.reshape(-1), tap[2].reshape(-1)
         energy = readings * readings
@@ -147,10 +132,7 @@ class ForwardModel:
 
 
 def forward_model(value: Any, constants: int) -> ForwardModel:
-    """Return the forward model of a value that `ForwardModel.to_json` has made, for a model that takes `constants`.
-
-    Raises one of DAMAGE if it is none, or of other constants.
-    """
+    """Return the forward model of `ForwardModel.to_json` for so many constants, or raise one of DAMAGE."""
     arrays = {name: unpacked(packed_array) for name, packed_array in value.items()}
     model = ForwardModel(**arrays)
     expected = {
@@ -189,13 +171,11 @@ def pooling(length: int) -> NDArray[np.float32]:
     return (share.clip(0) / (length / GRID)).astype(np.float32)
 
 
-QUIET_UNITS: Final = 0.02
-"""Amplitude in network units, added to a scan's own before the division by it: noise stays small."""
+QUIET_UNITS: Final = 0.02  # added to a scan's amplitude before the division by it: noise stays small
 _MOST: Final = 12.0  # largest reading over the amplitude; a contact on one taxel alone has 4
 PLACE_MM: Final = 5.0  # unit of a tap's place among features: about a taxel pitch
-ERROR_UNITS: Final = np.array([1.0, 5.0], dtype=np.float32)
-"""Units of the errors of a pose among features, in [mm] and [deg]: five usual errors."""
-MOST_ERROR: Final = 5.0  # largest error of a pose among features, in its unit: beyond it a pose states nothing
+ERROR_UNITS: Final = np.array([1.0, 5.0], dtype=np.float32)  # of a pose's errors, in [mm] and [deg]: five usual ones
+MOST_ERROR: Final = 5.0  # in these units: beyond it a pose states nothing
 _POSE_FEATURES: Final = 6
 
 
@@ -212,7 +192,7 @@ class FamiliarityCheck:
 
 
 def check_of(value: Any) -> FamiliarityCheck:
-    """Return the check of a value that `FamiliarityCheck.to_json` has made; raises one of DAMAGE if it is none."""
+    """Return the check of `FamiliarityCheck.to_json`, or raise one of DAMAGE."""
     if type(limit := value["limit"]) is not float or not math.isfinite(limit):
         raise ValueError(f"limit is {limit!r}, expected a number")
     return FamiliarityCheck(small_network(value["layers"]), limit)
@@ -232,11 +212,10 @@ def pair_width(readings: int) -> int:
 
 
 def pose_tap_features(window: NDArray[np.float32], poses: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the features (K - 1, inputs) of the earlier taps of a window, each beside the newest one.
+    """Return the features (K - 1, inputs) of the earlier taps of a window in network units, each beside the newest one.
 
     They are the newest tap, its difference to the earlier one, the sizes of both, and the earlier tap's pose: place,
-    cosine and sine of the turn, and the errors of both. The window (K, 3, rows, cols) is in network units, newest tap
-    first, and the poses (K, 5) are as model input.
+    cosine and sine of the turn, and the errors of both.
     """
     readings = window[0].size
     features = np.empty((len(window) - 1, pair_width(readings)), dtype=np.float32)
@@ -278,11 +257,7 @@ class Trust:
 
 
 def trust_of(value: Any, constants: int) -> Trust | None:
-    """Return the checks in a value that `Trust.to_json` made, of a model that takes so many constants; None if empty.
-
-    Raises:
-        ValueError: it is damaged, or of other constants; the message names the part.
-    """
+    """Return the checks of `Trust.to_json` for so many constants, None if empty; raises ValueError for damage."""
     if value == {}:
         return None
     try:

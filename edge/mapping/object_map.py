@@ -1,9 +1,8 @@
 """Map of an object in its own plane, larger than the pad, in memory that does not grow with the run.
 
-First what one pattern shows: its pixels of the map, what was touched, how high, how surely. Then the map. Evidence is
-counted by the distance that the pad has moved, and not by the scan, since a model makes the same mistake again while
-the same part of the object lies under the same taxels. Heights are those of a press plus an offset, by which it agrees
-with what lies on the map already where both touched.
+Evidence is counted by the distance that the pad has moved, and not by the scan, since a model makes the same mistake
+again while the same part of the object lies under the same taxels. Heights are those of a press plus an offset, by
+which it agrees with what lies on the map already where both touched.
 """
 
 from collections import deque
@@ -48,17 +47,13 @@ class Footprint(NamedTuple):
         col = np.minimum(cols.astype(np.intp), width - 2)
         down, right = (rows - row).astype(np.float32)[:, None], (cols - col).astype(np.float32)[:, None]
         flat, corner = layers.reshape(-1, depth), row * width + col
-        upper = _between(flat, corner, right)
-        lower = _between(flat, corner + width, right)
-        lower -= upper
-        lower *= down
-        lower += upper
-        return lower
+        upper, lower = (
+            _between(flat.take(left, axis=0), flat.take(left + 1, axis=0), right) for left in (corner, corner + width)
+        )
+        return _between(upper, lower, down)
 
 
-def _between(flat: NDArray[np.float32], left: NDArray[np.intp], share: NDArray[np.float32]) -> NDArray[np.float32]:
-    here = flat.take(left, axis=0)
-    there = flat.take(left + 1, axis=0)
+def _between(here: NDArray[np.float32], there: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray[np.float32]:
     there -= here
     there *= share
     there += here
@@ -104,10 +99,10 @@ def _reached(grid: Grid, centre_mm: float, reach_mm: float) -> tuple[int, NDArra
 def weigh(
     pattern: NDArray[np.float32], deviation: NDArray[np.float32] | None, pose: PadPose, pixel_mm: float, level: float
 ) -> tuple[NDArray[np.float32], float] | None:
-    """Return the evidence of a pattern, and the height of its top above what it does not touch, in [mm].
+    """Return the evidence (H, W, 4) of a pattern, and the height of its top in [mm]; None if it is flat.
 
-    None if it is flat; touched is where its share of the top exceeds `level`. Evidence is (H, W, 4): weight of what was
-    covered, log odds of a touch, information about the height in [1/mm^2], and that information times the pattern.
+    Evidence is the weight of what was covered, log odds of a touch, where the share of the top exceeds `level`,
+    information about the height in [1/mm^2], and that information times the pattern.
     """
     height, width = pattern.shape
     top_mm = float(np.partition(pattern, -8, axis=None)[-8:].mean())
@@ -130,7 +125,7 @@ def weigh(
 
 
 def _moved(pattern: NDArray[np.float32], pose: PadPose, pixel_mm: float) -> NDArray[np.float32]:
-    """Return the variance of each pixel that follows from the pose's error: it matters where the pattern is steep."""
+    """Return the variance of each pixel by the pose's error: it matters where the pattern is steep."""
     slope = np.zeros_like(pattern)
     across = (pattern[:, 2:] - pattern[:, :-2]) / np.float32(2 * pixel_mm)
     down = (pattern[2:] - pattern[:-2]) / np.float32(2 * pixel_mm)
@@ -160,7 +155,7 @@ class MapLayers:
 
 @dataclass(slots=True)
 class _Press:
-    """Strongest press so far of a pad that has not left its place, which began at `origin`."""
+    """Strongest press so far of a pad that has not left its place."""
 
     origin: PadPose
     pose: PadPose
@@ -195,8 +190,7 @@ class ObjectMap:
         if len(centre_mm) != 2 or not all(map(isfinite, centre_mm)):
             raise UsageError(f"the centre of a map is {centre_mm}, expected two finite numbers")
         self.grid = Grid(count, px_per_mm, centre_mm)
-        self.counts = {"fused": 0, "doubted": 0, "light": 0, "outside": 0}
-        """Patterns by their fate; those of presses too light to tell from drift are left out."""
+        self.counts = {"fused": 0, "doubted": 0, "light": 0, "outside": 0}  # light: not to be told from drift
         self._level = contact_level
         # Coverage, log odds of a touch, information about the height, and that times the height, as in the evidence.
         self._sums = np.zeros((count * count, 4), dtype=np.float32)
@@ -216,10 +210,7 @@ class ObjectMap:
         return ObjectMap(pixels / px_per_mm, px_per_mm, centre_mm=centre_mm, contact_level=self._level)
 
     def add(self, result: Result, pose: PadPose | None) -> None:
-        """Take a result and the pose of its pad; without contact, or without a pose, the press before is over.
-
-        Raises a UsageError where the pattern is not in [mm].
-        """
+        """Take a result and the pose of its pad; without contact, or without a pose, the press before is over."""
         sensor = result.scan.sensor
         if result.pattern is None or pose is None:
             if pose is None or not result.contact:
@@ -315,12 +306,9 @@ class ObjectMap:
         return float(weight @ offsets_mm / weight.sum())
 
     def _worth(self, pose: PadPose) -> float:
-        """Return how many taps a pattern is worth beside those before: a whole one a pitch away, under other taxels.
-
-        It is never worth nothing, since its noise and the error of its pose are new.
-        """
+        """Return how many taps a pattern is worth beside those before: a whole one a pitch away, under other taxels."""
         away_mm = min((place.away_mm(pose, _RADIUS_MM) for place in self._places), default=inf)
-        return min(1.0, max(0.05, away_mm / USPA44.pitch_mm))
+        return min(1.0, max(0.05, away_mm / USPA44.pitch_mm))  # its noise and the error of its pose are always new
 
 
 def _too_light(result: Result) -> bool:

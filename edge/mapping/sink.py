@@ -1,7 +1,4 @@
-"""Sink that fuses the results of a run into a map, shows it now and then, and writes its npz at the end.
-
-A reset stands for a new object, so that it ends the map and begins the next.
-"""
+"""Sink that fuses the results of a run into a map, shows it now and then, and writes its npz at the end."""
 
 import time
 from collections import Counter
@@ -26,29 +23,21 @@ from firmware_bridge.schedule import SENSOR_SILENT_NS
 
 
 class MapState(NamedTuple):
-    """State of a map: its contact, poses of the pads by sensor, patterns by their fate, and its place in [mm].
+    """State of a map as it is shown."""
 
-    The contact is (H, W): the probability of a touch, NaN where nothing came, -1 where only doubted patterns did.
-    """
-
-    contact: NDArray[np.float32]
-    pads: Mapping[str, PadPose]
-    counts: Mapping[str, int]
+    contact: NDArray[np.float32]  # (H, W), probability of a touch; NaN where nothing came, -1 where all was doubted
+    pads: Mapping[str, PadPose]  # by sensor
+    counts: Mapping[str, int]  # patterns by their fate
     size_mm: float
     centre_mm: tuple[float, float]
 
 
-SHOW_NS: Final = 500_000_000
-"""Time between two states that are shown, in [ns]; longer for a map of more than MOST_SHOWN_PX, which costs more."""
-MOST_SHOWN_PX: Final = 500
-"""Most pixels along a side of a map as it is shown, of a larger one every second or third: a page has not many more."""
+SHOW_NS: Final = 500_000_000  # time between two states that are shown; longer for a larger map, which costs more
+MOST_SHOWN_PX: Final = 500  # along a side of a map as it is shown, of a larger one every second or third
 
 
 class MapSink(Sink):
-    """Fusion of results at their poses into `whole`, a map; after a reset the next one.
-
-    Left out are patterns without a pose, and those of pads that are at one place `together` by their poses.
-    """
+    """Fusion of results at their poses into `whole`, a map; after a reset, as for a new object, the next one."""
 
     uses_poses = True
 
@@ -61,13 +50,13 @@ class MapSink(Sink):
         origin: SourceKind | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Check that the file can be written, with the layers, on `close` and at a reset; later ones are numbered.
+        """Take the file to write on `close` and at a reset, later ones with a number, or raise a SinkError.
 
         `show` is called with the map's state a few times a second and must not wait. `origin` is the kind of source
-        that the scans of a recording come from. Raises a SinkError where the file exists, or cannot be written.
+        that the scans of a recording come from.
         """
         self.whole = whole
-        self.without_pose = self.together = 0
+        self.without_pose = self.together = 0  # patterns left out, the latter of pads at one place by their poses
         self.show, self.origin = show, origin
         self._before: Counter[str] = Counter()
         self._written: list[Path] = []
@@ -95,7 +84,7 @@ class MapSink(Sink):
         return None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Fuse a result at its pose, on the next map if taps were forgotten as for a new object."""
+        """Fuse a result at its pose, on the next map if taps were forgotten."""
         if any(event.kind == "reset" for event in result.events):
             self._begin_next()
         sensor, pose = result.scan.sensor, result.pose
@@ -117,7 +106,7 @@ class MapSink(Sink):
         self._show()
 
     def close(self) -> None:
-        """Take the presses that have not ended, show the last state, and write the file; nothing fused, no file."""
+        """Take the presses that have not ended, write the file, and show the last state."""
         self._save()
         self._due_ns, self._unseen = 0, True
         self._show()

@@ -19,11 +19,7 @@ def _option(default: Any, form: str, text: str) -> Any:
 # fmt: off
 @dataclass(frozen=True, slots=True)
 class RuntimeOptions:
-    """Options of making results from scans, each with its form and text in the help of `edge-sr`.
-
-    Raises:
-        UsageError: the contact thresholds, the time or the taps are out of range.
-    """
+    """Options of making results from scans, each with its form and text in the help of `edge-sr`."""
 
     contact_on_counts: float = _option(
         ON_COUNTS, "--contact-on-counts N", "a tap begins when the z readings, summed over the pad, reach N counts; "

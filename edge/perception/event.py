@@ -1,7 +1,4 @@
-"""Events and notes of a run, each of a closed set of kinds: programs read the kind, the text is made for display.
-
-An event happens once; a note holds for as long as results carry it.
-"""
+"""Events of a run, which happen once, and notes, which results carry: programs read the kind, people the text."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
@@ -26,6 +23,7 @@ KINDS: Final[frozenset[str]] = frozenset(get_args(EventKind))
 NOTE_KINDS: Final[frozenset[str]] = frozenset(get_args(NoteKind))
 
 _OF_SENSOR = ("rest_level", "baseline_doubted", "gains_learned", "tap_dropped", "tap_without_pose", "tap_out_of_reach")
+# Texts of kinds that say more than their detail.
 _TEXTS: Final = {
     "reset": "earlier taps forgotten",
     "zeroing": "sensor {sensor}: no baseline yet, zeroing since the start",
@@ -38,26 +36,17 @@ _TEXTS: Final = {
     "baseline_cleared": "sensor {sensor}: the baseline is no longer in doubt",
     **dict.fromkeys(_OF_SENSOR, "sensor {sensor}: {detail}"),
 }
-"""Texts of kinds that say more than their detail."""
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One event of a run.
+    """One event of a run; docs/formats.md describes the kinds."""
 
-    Attributes:
-        time_ns: monotonic time, in [ns].
-        kind: one of KINDS, which docs/formats.md describes.
-        sensor: name of the sensor, or None if the event concerns all, or none.
-        detail: what the kind leaves open, in a user's words.
-        sensors: common prefix of the names of the sensors that an event of a link concerns, as in `Notice`.
-    """
-
-    time_ns: int
+    time_ns: int  # monotonic
     kind: EventKind
-    sensor: str | None
-    detail: str = ""
-    sensors: str = ""
+    sensor: str | None  # None if the event concerns all, or none
+    detail: str = ""  # what the kind leaves open, in a user's words
+    sensors: str = ""  # common prefix of the names of the sensors that an event of a link concerns, as in `Notice`
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "detail", harmless(self.detail))
@@ -74,19 +63,14 @@ class Event:
 
 
 class Report(Protocol):
-    """Takes an event of a sensor: its kind, and what that leaves open."""
+    """Takes an event of a sensor."""
 
     def __call__(self, kind: EventKind, detail: str = "") -> object: ...  # noqa: D102 - above
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """One remark on a result for its user.
-
-    Attributes:
-        kind: one of NOTE_KINDS, which docs/formats.md describes.
-        text: in a user's words.
-    """
+    """One remark on a result, in a user's words; docs/formats.md describes the kinds."""
 
     kind: NoteKind
     text: str
@@ -97,40 +81,27 @@ def joined(parts: Iterable[Event | Note]) -> str | None:
     return "; ".join(part.text for part in parts) or None
 
 
+# Age from which a reading is old, by the device's time stamps and counted from its fastest recent reading: three times
+# as long as a slow adapter holds readings.
 OLD_NS: Final = 50_000_000
-"""Age from which a reading is old, in [ns], by the device's time stamps and counted from its fastest recent reading:
-three times as long as a slow adapter holds readings."""
 
 
 def age_notes(scan: Scan) -> tuple[Note, ...]:
-    """Return the notes on a scan whose readings were old."""
-    if scan.device_ns is None:
-        if scan.unread_ns <= OLD_NS:
-            return ()
-        text = (
-            f"this reading may have been {scan.unread_ns / 1e9:.2f} s old when it arrived: nothing was read meanwhile"
-        )
-        return (Note("late", text),)
-    if scan.time_ns - scan.device_ns <= OLD_NS:
-        return ()
-    return (Note("late", f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it arrived"),)
+    """Return the notes on a scan whose readings were old, or may have been where nothing was read meanwhile."""
+    old_ns, was = scan.unread_ns, "may have been"
+    if scan.device_ns is not None:
+        old_ns, was = scan.time_ns - scan.device_ns, "was"
+    return (Note("late", f"this reading {was} {old_ns / 1e9:.2f} s old when it arrived"),) if old_ns > OLD_NS else ()
 
 
 UNCHECKED: Final = Note("not_checked", "not checked: the model has no checks")
-"""Note on each pattern of a model that nothing is known of by which to believe it."""
-
-
-def waited_note(waited_ns: int) -> Note:
-    """Return the note on a pattern that was ready more than OLD_NS after its newest reading arrived, in [ns]."""
-    return Note("late", f"this pattern was ready {waited_ns / 1e9:.2f} s after its newest reading arrived")
 
 
 def notes_on_missing(sensor: str, mounted: Collection[str], zeroed: Collection[str]) -> tuple[Note, ...]:
     """Return notes on what is stored for other sensors, `mounted` or `zeroed`, but not for this one."""
     notes: list[Note] = []
     if mounted and sensor not in mounted:
-        others = ", ".join(sorted(mounted))
-        text = f"the sensor file has no sensor {sensor}, only {others}: taken as wired"
+        text = f"the sensor file has no sensor {sensor}, only {', '.join(sorted(mounted))}: taken as wired"
         notes.append(Note("not_in_sensor_file", text))
     if zeroed and sensor not in zeroed:
         text = f"no stored baseline for sensor {sensor}, only for {', '.join(sorted(zeroed))}: zeroing"

@@ -1,14 +1,10 @@
 """Stage that learns the gains of a sensor's channels from its ordinary contacts: slow, bounded, drawn to their start.
 
-Nothing is computed while a pattern is made but a comparison: the strongest scan of a tap is kept, and is learned from
-once the pad is free again.
-
 The model is the distribution of contacts on simulated pads (`contacts.npz`): a mixture of normal distributions of a
 contact's 48 readings over the RMS of its z, whose means are linear in what differs from pad to pad. What explains a
 sensor's contacts are the inverses of its gains, the leans of its magnets (which show part of z in x and y), its
-unevenness and its drift (offsets, which matter less the stronger a contact is), and its pad's constants. Given the
-component that a contact belongs to, all of these enter linearly: so a contact adds to a matrix and a vector of fixed
-size, and now and then the best gains are the solution of one small convex problem.
+unevenness, its drift (offsets) and its pad's constants. Given the component that a contact belongs to, all of these
+enter linearly: a contact adds to a matrix and a vector of fixed size, and the best gains solve a small convex problem.
 """
 
 from dataclasses import dataclass, replace
@@ -28,49 +24,33 @@ from firmware_bridge.recording.npz_recording import read_npz
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES, UNMEASURED_CERTAINTY, Pad
 
 TAXELS: Final = USPA44.taxel_count
-LARGEST_COUNTS: Final = (1390.0, 1390.0, 13400.0)
-"""Largest readings of x, y and z of a contact that is used; chips are clipped a little above."""
+LARGEST_COUNTS: Final = (1390.0, 1390.0, 13400.0)  # of x, y, z of a contact that is used: chips clip a little above
 LEAST_COUNTS: Final = 200.0  # largest z of the weakest contact that is used: in weaker ones drift is over a fifth of it
-REMEMBERED: Final = 64
-"""Newest distinct contacts, of which a further one must differ: always the same contact teaches once."""
+REMEMBERED: Final = 64  # newest contacts, of which a further one must differ: always the same contact teaches once
 BOUND: Final = 0.25  # largest deviation of a gain from 1
 _FREEDOM: Final = 5.0  # degrees of freedom of Student's t, which weighs down contacts that no component explains well
 CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which measured gains are found to be another sensor's
 _OPEN: Final = 1 / np.sqrt(3)  # prior deviation of a constant over half of its range: uniform within it
 _Z: Final = slice(2 * TAXELS, 3 * TAXELS)
+# Linear parameters beside the pad's constants: inverse gains, leans of x and y, unevenness of z, and offsets.
 _LINEAR: Final = GAINS + 2 * TAXELS + TAXELS + GAINS
-"""Linear parameters beside the pad's constants: inverse gains, leans of x and y, unevenness of z, and offsets."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContactModel:
-    """Distribution of contacts.
+    """Distribution of contacts: k components, whose means depend on p constants of the pad."""
 
-    Attributes:
-        log_shares: (k,), log share of each component less half the log determinant of its covariance.
-        means: (k, 1 + p, GAINS): on a middle pad, then the change by half the range of each of p constants.
-        precisions: (k, GAINS, GAINS).
-        widening: factor on deviations, so that 90 % intervals hold nine in ten gains of simulated sensors.
-        bias: (GAINS,), mean error of the log-gains of simulated sensors after many contacts.
-        constants: name of each of the p constants, middle of its range, and half of the range.
-        constant_widening: factor on their deviations, likewise.
-    """
-
-    log_shares: NDArray[np.float64]
-    means: NDArray[np.float64]
-    precisions: NDArray[np.float32]
-    widening: float
-    bias: NDArray[np.float64]
-    constants: tuple[tuple[str, float, float], ...]
-    constant_widening: float
+    log_shares: NDArray[np.float64]  # (k,), log share of each less half the log determinant of its covariance
+    means: NDArray[np.float64]  # (k, 1 + p, GAINS): on a middle pad, then the change by half the range of a constant
+    precisions: NDArray[np.float32]  # (k, GAINS, GAINS)
+    widening: float  # factor on deviations, so that 90 % intervals hold nine in ten gains of simulated sensors
+    bias: NDArray[np.float64]  # (GAINS,), mean error of the log-gains of simulated sensors after many contacts
+    constants: tuple[tuple[str, float, float], ...]  # name, middle and half of the range of each of the p
+    constant_widening: float  # factor on their deviations, likewise
 
 
 def load_contact_model(path: Path = CONTACTS) -> ContactModel:
-    """Load the model that `train.learning.contact_mixture` has made.
-
-    Raises:
-        EdgeError: the file cannot be read, or is of another pad.
-    """
+    """Load the model that `train.learning.contact_mixture` has made, or raise an EdgeError."""
     try:
         of_contacts = ("share", "means", "factors", "widening", "bias")
         of_constants = ("names", "middles", "halves", "constant_widening")
@@ -100,20 +80,11 @@ def load_contact_model(path: Path = CONTACTS) -> ContactModel:
 
 
 class GainLearner:
-    """Learner of one sensor's gains; its memory does not grow.
-
-    Attributes:
-        contacts: distinct contacts so far.
-        deviations: (GAINS,) standard deviations of the log-gains.
-        constant_deviations: (p,) of the constants.
-    """
+    """Learner of one sensor's gains; its memory does not grow."""
 
     def __init__(self, model: ContactModel, start: Pad | None = None, look_from: "GainLearner | None" = None) -> None:
-        """Begin with the gains of a pad, and their intervals; None for gains of 1.
-
-        For a further pass over the same contacts it begins to look from the results of another learner.
-        """
-        self.contacts = 0
+        """Begin with the gains of a pad, else 1; a further pass over the same contacts looks from another's results."""
+        self.contacts = 0  # distinct ones
         self._model = model
         constants = model.means.shape[1] - 1
         size = _LINEAR + constants
@@ -134,8 +105,8 @@ class GainLearner:
         self._best = self._begin.copy() if look_from is None else look_from._best.copy()
         before = np.diag(np.linalg.inv(self._prior))
         self._before, self._after = before[:GAINS], before[:GAINS]
-        self.deviations = model.widening * np.sqrt(before[:GAINS])
-        self.constant_deviations = np.sqrt(before[_LINEAR:])
+        self.deviations = model.widening * np.sqrt(before[:GAINS])  # of the log-gains
+        self.constant_deviations = np.sqrt(before[_LINEAR:])  # over half of their ranges
         self._square = np.zeros((size, size))
         self._product = np.zeros(size)
         self._weight = self._count = 0.0
@@ -183,10 +154,9 @@ class GainLearner:
         return float(moved.mean() / max(float((self._before - self._after).clip(0).mean()), 1e-9))
 
     def learn(self, counts: NDArray[np.floating], dead: NDArray[np.bool_] | None = None) -> bool:
-        """Learn from one contact, and return whether the gains have changed.
+        """Learn from a contact's zeroed counts (3, rows, cols), and return whether the gains have changed.
 
-        Weak and clipped contacts, and those that resemble a recent one, are left out. Counts (3, rows, cols) are
-        zeroed, with estimates for dead taxels (rows, cols), from which nothing is learned; None if all live.
+        Weak and clipped contacts, those that resemble a recent one, and readings of dead taxels are left out.
         """
         read = np.asarray(counts, dtype=np.float64).reshape(GAINS)
         peaks = np.abs(read).reshape(len(AXES), TAXELS).max(axis=1)
@@ -213,7 +183,7 @@ class GainLearner:
         return True
 
     def solve(self) -> None:
-        """Solve for the gains now, as far as a few steps go."""
+        """Solve for the gains, as far as a few steps go."""
         for _ in range(4):
             if not self._step():
                 break
@@ -317,20 +287,16 @@ def _prior(constants: int) -> NDArray[np.float64]:
 
 
 class Learn:
-    """Stage: learns the sensor's gains from its contacts, brings them into use, and reports it.
+    """Stage: learns the sensor's gains from the strongest scan of each contact, once the pad is free.
 
     It begins with what was measured. What an earlier run has learned is in use until this run is as sure, but is no
     beginning: counted again with each start, the same errors would come to look certain.
-
-    Attributes:
-        waiting: a contact is there to be learned from, once the pad is free.
     """
 
     def __init__(
         self, model: ContactModel, measured: Pad | None, pad: SensorPad, check: PatternCheck | None, report: Report
     ) -> None:
-        """Begin with the pad as measured, and the one in use, also by what was learned before."""
-        self.waiting = False
+        self.waiting = False  # a contact is there to be learned from
         self._pad, self._check, self._report = pad, check, report
         self._learner = GainLearner(model, measured)
         self._from_file = measured is not None and measured.gains is not None
@@ -341,10 +307,7 @@ class Learn:
         self._learned: Pad | None = None
 
     def __call__(self, step: Step, made: Estimate, counts: NDArray[np.float32]) -> None:
-        """Take a contact's pattern and its readings (3, rows, cols).
-
-        A pattern that is not to be trusted teaches nothing, and nor does what came before it in the same contact.
-        """
+        """Take a contact's readings; one that is not to be trusted teaches nothing, nor what came before it."""
         force_counts = step.force_counts or 0.0
         if made.trusted is False:
             self.waiting, self._force_counts = False, 0.0

@@ -20,25 +20,15 @@ REACH_MM: Final = 4.0  # way of a contact from one result to the next; further a
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """One connected area of touch, on the axes of the pad: origin in the middle of its face, x right, y down.
+    """One connected area of touch, on the axes of the pad: origin in the middle of its face, x right, y down."""
 
-    Attributes:
-        area_mm2: of the touched pixels.
-        centre_mm: x, y of the middle of its pattern.
-        force_n: x, y, z of its share of the traction; None of a model without traction.
-        normal: unit vector of the touched surface, into the pad, by the plane through its pattern.
-        long_axis_deg: direction of its longer axis from x to y, -90 to 90.
-        size_mm: length along that axis and width across, four standard deviations each.
-        trusted: as the result's.
-    """
-
-    area_mm2: float
-    centre_mm: tuple[float, float]
-    force_n: tuple[float, float, float] | None
-    normal: tuple[float, float, float]
-    long_axis_deg: float
-    size_mm: tuple[float, float]
-    trusted: bool | None
+    area_mm2: float  # of the touched pixels
+    centre_mm: tuple[float, float]  # x, y of the middle of its pattern
+    force_n: tuple[float, float, float] | None  # x, y, z of its share of the traction; None of a model without
+    normal: tuple[float, float, float]  # of the touched surface, into the pad, by the plane through its pattern
+    long_axis_deg: float  # direction of its longer axis from x to y, -90 to 90
+    size_mm: tuple[float, float]  # length along that axis and width across, four standard deviations each
+    trusted: bool | None  # as the result's
 
     @property
     def shear_ratio(self) -> float | None:
@@ -97,10 +87,7 @@ def _patch(
 def _forces(
     result: Result, parts: list[NDArray[np.float32]], contract: Contract
 ) -> list[tuple[float, float, float] | None]:
-    """Return the force of each patch in [N]: traction goes to the patches in proportion to their pattern there.
-
-    Where no patch has any, it goes to the nearest one, so that together they are the result's whole force.
-    """
+    """Return the force of each patch: traction goes to the patches by their pattern there, else to the nearest one."""
     if result.traction is None or not parts:
         return [None] * len(parts)
     height, width = result.traction.shape[1:]
@@ -153,15 +140,11 @@ class PatchEvent(NamedTuple):
 
 
 class PatchEvents:
-    """Follower of one sensor's contacts from result to result.
+    """Follower of one sensor's contacts from result to result; patterns that are not believed count for nothing.
 
     A contact begins once it was there for SCANS results in a row, and ends once it was missing for as many; it moves
     by `move_mm` from where it was when that was last reported; it slips where its shear over its normal force reaches
-    `slip_ratio`, and again only after it has fallen to four fifths of it. Patterns that are not believed count for
-    nothing.
-
-    Raises:
-        UsageError: a number is not positive.
+    `slip_ratio`, and again only after it has fallen to four fifths of it. Raises UsageError if one is not positive.
     """
 
     def __init__(self, contract: Contract, *, slip_ratio: float = 0.5, move_mm: float = 1.0) -> None:

@@ -19,18 +19,13 @@ from edge.perception.result import Estimate, Wrench
 from edge.perception.trust_check import SensorPad
 from firmware_bridge.pad_geometry import SensorGeometry
 
-LEAST_FORCE_N: Final = 0.1
-"""Least z force for a centre of pressure, which noise would move about below it; a tap begins at ten times as much."""
+LEAST_FORCE_N: Final = 0.1  # for a centre of pressure, which noise moves about below it; a tap begins at ten times that
 _N_OF_KPA_MM2: Final = 1e-3
-_SHEAR_PRIOR_N2: Final = 5.0
-"""Sum of squared shear, in [N^2], by which a sensor's contacts outweigh the nominal counts per newton of x and y."""
+_SHEAR_PRIOR_N2: Final = 5.0  # squared shear by which contacts outweigh the nominal counts per newton of x and y
 
 
 def wrench_of(traction_kpa: NDArray[np.floating], pixel_mm: float) -> Wrench:
-    """Sum a traction (3, h, w) of x, y, z over the face to force and torque, constant within each pixel of this side.
-
-    The middle of the grid lies over that of the face.
-    """
+    """Sum a traction (3, h, w) of x, y, z, constant within each pixel of this side, to force and torque."""
     height, width = traction_kpa.shape[1:]
     fx, fy, fz, tx, ty, tz = (_sums(height, width, pixel_mm) @ traction_kpa.ravel()).tolist()
     presses = fz >= LEAST_FORCE_N
@@ -55,10 +50,9 @@ def _sums(height: int, width: int, pixel_mm: float) -> NDArray[np.float64]:
 class Balance:
     """Force of one sensor's contacts by the sums of its readings, over which the network's traction is distributed.
 
-    A network weighs each scan anew: the two pads of a gripper, which carry equal and opposite forces, disagree by it
-    where their plain sums agree. So changes of a force are those of the sums, and the network tells what the sums mean:
-    newtons for a count of z and counts of x and y that pressing alone makes, by the contact so far, and newtons for a
-    count of shear, by all contacts of the sensor.
+    By a network the two pads of a gripper, which carry equal and opposite forces, disagree where their plain sums
+    agree. So changes of a force are those of the sums, and the network tells what the sums mean: newtons for a count of
+    z and counts of x and y that pressing makes, by the contact so far, newtons for a count of shear by all contacts.
     """
 
     def __init__(self, geometry: SensorGeometry) -> None:
@@ -78,10 +72,9 @@ class Balance:
         tap: int,
         operator: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Return the network's traction (3, h, w) with the force of the readings (3, rows, cols) that it was made from.
+        """Return the network's traction (3, h, w) with the force of its readings (3, rows, cols) in network units.
 
-        The pattern (H, W) is in [mm], readings in network units; `tap` numbers the contact, and the operator is the
-        pad's.
+        The pattern (H, W) is in [mm]; `tap` numbers the contact, and the operator is the pad's.
         """
         if operator is not self._operator:
             self._use_pad(operator, pattern.shape)
@@ -137,10 +130,7 @@ def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:
 def touched_patch(
     pattern: NDArray[np.float32], touching: NDArray[np.bool_], pixel_pitch_mm: float
 ) -> tuple[float, tuple[float, float] | None]:
-    """Return area in [mm2] and pattern-weighted centroid of the touched pixels of a pattern (H, W), above zero there.
-
-    The centroid is x, y in [mm] from the pattern's centre, x to the right and y down; None if no pixel is touched.
-    """
+    """Return area and weighted centroid x, y of the touched pixels (H, W), in [mm] from the pattern's centre."""
     rows, cols = np.nonzero(touching)
     if rows.size == 0:
         return 0.0, None
@@ -163,10 +153,7 @@ class Describe:
     def __call__(
         self, made: Estimate, tap: int, newest: NDArray[np.float32], about: tuple[float, float] | None
     ) -> None:
-        """Add to the estimate of a tap what follows from its pattern, and from its doubt and RMS, which are `about`.
-
-        The newest readings (3, rows, cols) are in network units.
-        """
+        """Add to the estimate of a tap what follows; `about` are doubt and RMS, the readings are in network units."""
         contract, pattern, deviation = self._contract, made.pattern, made.deviation
         if pattern is None:
             raise ValueError("the estimate has no pattern")

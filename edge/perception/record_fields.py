@@ -1,8 +1,6 @@
-"""Table of the fields of a result, from which every output and the pages that describe them are made.
+"""Table of the fields of a result, from which every output and, by `tests/docs/field_tables.py`, the pages are made.
 
-A new field is one row here, and the attribute or the function that gives its value. By default it is then in the JSON
-record, the npz and the ROS message, and with a `byte` in shared memory; `python tests/docs/field_tables.py` writes it
-into the pages.
+A new field is one row here: in the JSON record, the npz and the ROS message, and with a `byte` in shared memory.
 """
 
 import math
@@ -23,51 +21,30 @@ from firmware_bridge.scans.scan import Scan, VendorReading
 from firmware_bridge.zeroing.drift_tracker import Drift
 
 Function = Callable[[Any], Any]
-PLACE_IN_HEADER: Final = -1
-"""Mark of a map in shared memory: its byte follows from the map's size, so the header states it."""
+PLACE_IN_HEADER: Final = -1  # mark of a map in shared memory: its byte follows from the map's size
 
 
 class Out(Flag):
-    """Outputs that hold a field, in addition to shared memory, where a field has a byte.
+    """Outputs that hold a field, in addition to shared memory, where a field has a byte."""
 
-    Attributes:
-        RECORD: the JSON record, and with it zenoh, MCAP, the live page and, of a single value, ROS diagnostics.
-        NPZ: arrays that `edge-sr convert` makes of a recording.
-        ROS: members of tactile_edge_sr/msg/Result.
-        MAP: maps next to the record: in lines of JSON, in packed messages and as grids of MCAP.
-        ALL: all but maps.
-    """
-
-    RECORD = auto()
-    NPZ = auto()
-    ROS = auto()
-    MAP = auto()
+    RECORD = auto()  # of JSON, and with it zenoh, MCAP, the live page and, of a single value, ROS diagnostics
+    NPZ = auto()  # arrays that `edge-sr convert` makes of a recording
+    ROS = auto()  # members of tactile_edge_sr/msg/Result
+    MAP = auto()  # next to the record: in lines of JSON, in packed messages and as grids of MCAP
     ALL = RECORD | NPZ | ROS
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Type of a value in each output.
+    """Type of a value in each output."""
 
-    Attributes:
-        label: name of the type in JSON.
-        array: numpy's type, in npz.
-        packed: struct's character, in shared memory.
-        message: ROS's type.
-        unknown: value for "unknown" in outputs without null; None where the value is always available.
-        words: the values of a choice. In shared memory they are numbered from 1, so that memory that nobody wrote is
-            none of them, and the order is part of the format.
-        shape: name of an array's shape: "scan", "pattern", "deviation", "traction" or "poses", which has a row for each
-            tap.
-    """
-
-    label: str
-    array: str = ""
-    packed: str = ""
-    message: str = ""
-    unknown: Any = None
-    words: tuple[str, ...] = ()
-    shape: str = ""
+    label: str  # in JSON
+    array: str = ""  # numpy's, in npz
+    packed: str = ""  # struct's character, in shared memory
+    message: str = ""  # in ROS
+    unknown: Any = None  # value for "unknown" in outputs without null; None where the value is always available
+    words: tuple[str, ...] = ()  # of a choice; numbered in shared memory, from 1, since 0 is memory that nobody wrote
+    shape: str = ""  # of an array: "scan", "pattern", "deviation", "traction" or "poses", a row for each tap
 
 
 class Column(NamedTuple):
@@ -130,7 +107,7 @@ class Field:
         return self.parts or (self.name,)
 
     def in_record(self) -> Column:
-        """Return the column of the JSON record, in which null stands for an unknown value."""
+        """Return the column of the JSON record, with null for an unknown value."""
         make = self.make if self.json is None else self.json
         if self.decimals is not None:
             rounded = methodcaller("round" if self.kind.shape else "__round__", self.decimals)
@@ -248,6 +225,7 @@ _NEXT_TAP_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg")
 _next_tap_numbers: Final = attrgetter(*_NEXT_TAP_KEYS)
 _NEXT_TAP_PARTS: Final = tuple(f"next_tap_{key}" for key in _NEXT_TAP_KEYS)
 
+# Every field, in the order of the outputs but for shared memory, whose order is that of the bytes.
 # fmt: off
 FIELDS: Final = (
     Field("time_ns", _NUMBER, "scan.time_ns", "monotonic time of arrival (`CLOCK_MONOTONIC`)", byte=16),
@@ -382,7 +360,6 @@ FIELDS: Final = (
           "taxel was not zeroed", make=attrgetter("counts"), out=Out.NPZ),
 )
 # fmt: on
-"""Every field of a result, in the order of the outputs but for shared memory, whose order is that of the bytes."""
 
 MAPS: Final = tuple(field for field in FIELDS if Out.MAP in field.out)
 

@@ -1,19 +1,15 @@
-"""Result of the runtime for one scan, its draft, and the last pattern, which a draft may take instead of a new one.
-
-The stages of a sensor fill the draft in turn; it is frozen once, at the end.
-"""
+"""Result of one scan, its draft, which the stages fill and which is frozen once, and the pattern of a scan before."""
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.event import OLD_NS, Event, Note, joined, waited_note
+from edge.perception.event import OLD_NS, Event, Note, joined
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses import PadPose
 from firmware_bridge.scans.scan import Scan
@@ -24,9 +20,7 @@ State = Literal["zeroing", "incomplete", "baseline_in_doubt", "idle", "contact",
 Filled = Literal["neighbours"]
 WrenchOrigin = Literal["calibrated", "nominal"]
 Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"]
-"""Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
-its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the model expects a large
-error; it was trained on no press so deep or strong, or on no such pad; the baseline is in doubt."""
+# Why a pattern is not to be believed, each with what to look for.
 REASON_TEXTS: Final[dict[Reason, str]] = {
     "stuck": "a taxel repeats itself (stuck?)",
     "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
@@ -37,25 +31,16 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
     "pad": "the sensor file's pad is far outside those that the model was trained on (the file? train for this pad)",
     "baseline": "the baseline is in doubt (free the pad and zero again)",
 }
-"""Reasons in a user's words, each with what to look for."""
 
 
 class Wrench(NamedTuple):
-    """Total force and torque on a pad.
-
-    Attributes:
-        force_n: x, y, z in [N].
-        torque_n_mm: about x, y, z through the middle of the face, in [N mm]; the last is the twist.
-        centre_of_pressure_mm: x, y from the middle of the point where the z force alone would give the torques about x
-            and y, in [mm]; None if hardly anything presses.
-        shear_ratio: tangential over normal force, whatever the sensor's counts per newton; None if hardly anything
-            presses.
-    """
+    """Total force and torque on a pad, x, y, z; the centre and the ratio are None if hardly anything presses."""
 
     force_n: tuple[float, float, float]
-    torque_n_mm: tuple[float, float, float]
+    torque_n_mm: tuple[float, float, float]  # through the middle of the face; the last is the twist
+    # From the middle of the face: where the z force alone gives the torques about x and y.
     centre_of_pressure_mm: tuple[float, float] | None
-    shear_ratio: float | None
+    shear_ratio: float | None  # tangential over normal force, whatever the sensor's counts per newton
 
 
 class NextTap(NamedTuple):
@@ -69,27 +54,9 @@ class NextTap(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """One scan and what was computed from it; every scan has one, whatever its state.
+    """One scan and what was computed from it; every scan has one, whatever its state; None stands for unknown.
 
-    Attributes that are not listed here are fields of a record: `edge.perception.record_fields` describes them. None
-    stands for an unknown or missing value.
-
-    Attributes:
-        scan: the scan as it arrived.
-        pattern: (H, W) float32 in `pattern_unit`, as is `deviation`; `traction` is (3, h, w) float32 in [kPa].
-        zeroed: (3, rows, cols) float32, each taxel's newest reading over the baseline in counts, along the pad's axes,
-            NaN if it was not zeroed; dead taxels as they read. None without a baseline.
-        window: (taps, 3, rows, cols) float32, the taps that the pattern is made from, newest first, as `zeroed` with
-            estimates for dead taxels; None without contact.
-        pose: of the pad at this scan, in the object's plane; None where it is not available.
-        poses: (taps, 5) float32, poses of the same taps as `window` in the axes of the newest tap's pad: dx and dy in
-            [mm], turn in [deg], and their standard deviations; None for a model that takes no poses.
-        wrench: sums of the traction over the pad, see edge.perception.pattern_description.
-        baseline: subtracted from the scan.
-        drift: drift that was followed since the baseline was taken, and the step in rest level that was not.
-        dead: dead taxels, row-major from the top left, and the reason of each; empty if all are alive.
-        notes: remarks for the user, such as why zeroing started over.
-        events: events before this scan: taps were forgotten, zeroing was done or refused, the rest level made a step.
+    The table of `edge.perception.record_fields` describes all that is a field of a record.
     """
 
     scan: Scan
@@ -98,19 +65,20 @@ class Result:
     state: State
     contact: bool | None = None
     taps_used: int = 0
-    pattern: NDArray[np.float32] | None = None
+    pattern: NDArray[np.float32] | None = None  # (H, W), as is the deviation
     pattern_unit: str = ""
     deviation: NDArray[np.float32] | None = None
+    # (3, rows, cols): newest readings over the baseline, along the pad's axes; NaN if not zeroed, dead taxels as read
     zeroed: NDArray[np.float32] | None = None
-    window: NDArray[np.float32] | None = None
+    window: NDArray[np.float32] | None = None  # (taps, 3, rows, cols), newest first, with estimates for dead taxels
     pose: PadPose | None = None
-    poses: NDArray[np.float32] | None = None
+    poses: NDArray[np.float32] | None = None  # (taps, 5); None for a model that takes none
     force_counts: float | None = None
     force_n: float | None = None
     area_mm2: float | None = None
     centroid_mm: tuple[float, float] | None = None
     interval_mm: float | None = None
-    traction: NDArray[np.float32] | None = None
+    traction: NDArray[np.float32] | None = None  # (3, h, w) in [kPa]
     wrench: Wrench | None = None
     wrench_origin: WrenchOrigin | None = None
     reused_from: int | None = None
@@ -127,7 +95,7 @@ class Result:
     baseline: Baseline | None = None
     baseline_age_s: float | None = None
     drift: Drift | None = None
-    dead: Mapping[int, str] = field(default_factory=dict)
+    dead: Mapping[int, str] = field(default_factory=dict)  # taxels, row-major from the top left, and the reason of each
     filled: Filled | None = None
     gains_certainty: float | None = None
     scale_error: float | None = None
@@ -156,31 +124,27 @@ class Result:
 
     @property
     def untrusted_text(self) -> str | None:
-        """Reason for which the pattern is not to be believed, for a person; None where it is, or is not checked."""
+        """Why the pattern is not to be believed, for a person; None where it is, or is not checked."""
         return None if self.untrusted_reason is None else REASON_TEXTS[self.untrusted_reason]
 
     def baseline_text(self) -> str:
-        """Return id and age of the baseline in words."""
+        """Return id and age of the baseline."""
         if self.baseline is None:
             return "no baseline"
-        if self.baseline_age_s is None:
-            return f"baseline {self.baseline.id} of unknown age"
-        return f"baseline {self.baseline.id} {age_text(self.baseline_age_s)} old"
+        return f"baseline {self.baseline.id} {age_text(self.baseline_age_s)}"
 
 
-def age_text(age_s: float) -> str:
-    """Return an age in [s] as text in seconds, minutes or hours."""
-    return f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min" if age_s < 36000 else f"{age_s / 3600:.0f} h"
+def age_text(age_s: float | None) -> str:
+    """Return how old something is, in seconds, minutes or hours."""
+    if age_s is None:
+        return "of unknown age"
+    age = f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min" if age_s < 36000 else f"{age_s / 3600:.0f} h"
+    return f"{age} old"
 
 
 def mask_bits(taxels: NDArray[np.bool_]) -> int:
     """Return a (rows, cols) mask as a number: bit i is taxel i, row-major from the top left."""
-    return _bits(taxels.tobytes())
-
-
-@lru_cache(maxsize=256)  # most scans have one of a few masks, and numpy takes ten times as long on sixteen taxels
-def _bits(taxels: bytes) -> int:
-    return int.from_bytes(np.packbits(np.frombuffer(taxels, dtype=np.bool_), bitorder="little").tobytes(), "little")
+    return int.from_bytes(np.packbits(taxels, bitorder="little").tobytes(), "little")
 
 
 class Window(NamedTuple):
@@ -196,7 +160,7 @@ class Window(NamedTuple):
 
 @dataclass
 class Estimate:
-    """Pattern of a window, and everything that follows from it: fields of a result, under their names there."""
+    """Pattern of a window, and all that follows from it: fields of a result, under their names there."""
 
     taps_used: int
     window: NDArray[np.float32]
@@ -219,17 +183,11 @@ class Estimate:
 
 
 class Step:
-    """Draft of one scan's result: fields of it under their names there, and what the stages tell each other.
+    """Draft of one scan's result: fields of it under their names there, and what the stages tell each other."""
 
-    Attributes:
-        readings: (3, rows, cols) in counts over the baseline, with estimates for dead taxels.
-        doubted: drift or an old baseline explains the readings as well as a touch.
-        due: taps of which a pattern is due; None where none is.
-    """
-
-    readings: NDArray[np.float32] | None = None
-    doubted: bool = False
-    due: Window | None = None
+    readings: NDArray[np.float32] | None = None  # (3, rows, cols), as `zeroed` with estimates for dead taxels
+    doubted: bool = False  # drift or an old baseline explains the readings as well as a touch
+    due: Window | None = None  # taps of which a pattern is due
     estimate: Estimate | None = None
 
     contact: bool | None = None
@@ -266,7 +224,8 @@ class Step:
             waited_ns = done_ns - self.scan.time_ns
             self.latency_us = waited_ns / 1e3
             if waited_ns > OLD_NS:
-                self.notes = (*self.notes, waited_note(waited_ns))
+                late = f"this pattern was ready {waited_ns / 1e9:.2f} s after its newest reading arrived"
+                self.notes = (*self.notes, Note("late", late))
         # What no stage has set is not in the dictionary, and has its default in the result.
         values: dict[str, Any] = dict(vars(self))
         for name in ("readings", "doubted", "due", "estimate"):
@@ -285,8 +244,8 @@ class Step:
 
 NOISE_COUNTS: Final = 2.0  # standard deviation of a reading at rest: 1.7 to 2.6 in recordings
 _CHANGE_COUNTS: Final = math.sqrt(2) * NOISE_COUNTS  # the same of a change, since noise is in both scans
+# Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors.
 MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
-"""Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
 
 
 class LastPattern(NamedTuple):
@@ -297,18 +256,11 @@ class LastPattern(NamedTuple):
     made_of: Window
 
     def reuse(self, step: Step, due: Window) -> bool:
-        """Give a step the estimate if readings and poses have not changed beyond noise since; return whether it has it.
-
-        Nor must the maker have changed, which is what distinguishes the pattern from others.
-        """
+        """Give a step the estimate if nothing has changed beyond noise since; return whether it has it."""
         before = self.made_of
-        if due.made_by != before.made_by:
+        if due.made_by != before.made_by:  # slots and poses are then as many
             return False
-        if due.poses is not None and (
-            before.poses is None
-            or due.poses.shape != before.poses.shape
-            or (np.abs(due.poses - before.poses) > MOVED).any()
-        ):
+        if due.poses is not None and before.poses is not None and (np.abs(due.poses - before.poses) > MOVED).any():
             return False
         change = due.counts[0] - before.counts[0]
         # Noise reaches neither five of its deviations in one reading, nor 1.4 of them in the RMS of all.

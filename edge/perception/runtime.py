@@ -1,7 +1,4 @@
-"""Scan in, result out: the stages of each sensor in their order, and one call of the model for all that wait.
-
-`Sensor.follow` has the order of the stages before the model, `Sensor.finish` that of those after it.
-"""
+"""Scan in, result out: the stages of each sensor in their order, and one call of the model for all that wait."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -21,7 +18,7 @@ from edge.perception.gain_learning import ContactModel, Learn
 from edge.perception.pattern_description import Describe
 from edge.perception.result import Estimate, LastPattern, Result, Step, Window
 from edge.perception.taps import Taps, TapTracker
-from edge.perception.taxel_health import Health, TaxelEstimator
+from edge.perception.taxel_health import Health
 from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.perception.zeroing import BaselineDoubt, Zeroing
 from edge.validation import check_baselines, check_counts_per_newton, check_kind, check_mountings, check_pads
@@ -38,14 +35,7 @@ MOST_TOGETHER: Final = 4  # sensors whose patterns are made in one call: scans t
 
 
 class Sensor:
-    """Stages of one sensor, made complete once with what is stored for it.
-
-    Attributes:
-        last: its last pattern, which is used again while nothing changes; None before one, or where none must be.
-        pad: its constants and gains.
-        learn: learns its gains; None where nothing is to be learned.
-        tracker: of its taps.
-    """
+    """Stages of one sensor, made complete once with what is stored for it."""
 
     def __init__(self, name: str, time_ns: int, runtime: "Runtime") -> None:
         """Begin with the first scan of a runtime's sensor, at a time in [ns]."""
@@ -54,7 +44,7 @@ class Sensor:
         mounting = mounting if mounting is not None and mounting.turns_axes else None
         pad = _of(name, runtime.pad)
         self.events: list[Callable[[int], Event]] = []  # at the time of the next scan
-        self.last: LastPattern | None = None
+        self.last: LastPattern | None = None  # used again while nothing changes
         self.pad = SensorPad(
             contract, trust, pad, _of(name, runtime.counts_per_newton), runtime.scale_intervals.get(name)
         )
@@ -80,10 +70,7 @@ class Sensor:
             self._doubt.begin(baseline.origin)
 
     def follow(self, step: Step, track: PoseTrack | None, events: list[Callable[[int], Event]]) -> None:
-        """Pass the step of the sensor's next scan through the stages before the model; a window is due then, or none.
-
-        It takes the events of all sensors with those of its own; `track` has the poses of its pad, None without.
-        """
+        """Pass the step of the next scan, which takes the events of all, through the stages before the model."""
         scan = step.scan
         if self._received_ns is not None and scan.time_ns - self._received_ns > TAPS_FORGOTTEN_NS:
             self.lose_touch()
@@ -126,7 +113,7 @@ class Sensor:
             step.force_n = scan.vendor_force_n[2]
 
     def begin(self, step: Step, due: Window) -> tuple[Estimate, NDArray[np.float32]]:
-        """Return an estimate of the taps of a window that belong together, and the model's input for its pattern."""
+        """Return an estimate of the taps of a window that belong together, and the model's input for it."""
         scaled = due.counts / self.pad.counts_per_unit
         if due.poses is None:
             scaled[due.taps :] = 0
@@ -161,11 +148,7 @@ class Sensor:
         self._zeroing.zero_again(force=force, doubted=self._doubt.reported is not None)
 
     def lose_touch(self) -> None:
-        """Forget earlier readings and taps, since no scan of the sensor arrived for a time.
-
-        Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one;
-        a contact is believed again once the pad was seen at rest.
-        """
+        """Forget earlier readings and taps, since no scan of the sensor arrived for a time."""
         self.tracker.reset()
         self.last = None
         self._health.forget()
@@ -183,41 +166,27 @@ def _of(name: str, setting: Any) -> Any:
 
 @dataclass(eq=False, repr=False)
 class Runtime:
-    """Maker of one result per scan; `open_runtime` makes one, and describes the settings that are not listed here.
+    """Maker of one result per scan; `open_runtime` makes one, and describes the settings that have no comment here.
 
-    Attributes:
-        estimator: of dead taxels, on the same grid; without it there is no pattern while a taxel is dead.
-        contacts: distribution of contacts by which gains are learned, if the options ask for that; without it none are.
-        mountings: directions of a sensor's axes, by name; without one the axes are as wired.
-        measured: pads without what was learned, by name, from which learning begins; None for `pad`.
-        scale_intervals: 90 % intervals of counts per newton, by name.
-        unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;
-            from then on ages follow scan time.
-        trust: checks that the model brings along; None without.
-        unposed: name of the model if it takes no poses, reported to a user who states some; None if it takes them.
-        waiting: the newest scan of each sensor that waits for its pattern. A newer scan keeps the place of the one it
-            overtakes: the sensor that has waited longest is the first.
-
-    Raises:
-        ModelError: the model is for another sensor.
-        UsageError: counts per newton, a pad or a number of taps are out of range, or a baseline or a mounting is of
-            another grid; the options ask for more taps than the model takes.
+    Raises a ModelError where the model is for another sensor, and a UsageError where a setting is out of range, of
+    another grid, or asks for more taps than the model takes.
     """
 
     model: Model
     _: KW_ONLY
     source: SourceKind
-    estimator: TaxelEstimator | None = None
-    contacts: ContactModel | None = None
+    estimator: NDArray[np.float64] | None = None  # of dead taxels; without it they allow no pattern
+    contacts: ContactModel | None = None  # by which gains are learned, if the options ask for that
     geometry: SensorGeometry = USPA44
     baselines: Mapping[str, Baseline] = field(default_factory=dict)
     counts_per_newton: float | Mapping[str, float] | None = None
-    mountings: Mapping[str, Mounting] = field(default_factory=dict)
+    mountings: Mapping[str, Mounting] = field(default_factory=dict)  # by name; without one the axes are as wired
     pad: Pad | Mapping[str, Pad] | None = None
-    measured: Mapping[str, Pad] | None = None
-    scale_intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    measured: Mapping[str, Pad] | None = None  # by name, without what was learned; None for `pad`
+    scale_intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # 90 %, of counts per newton
     options: RuntimeOptions = DEFAULTS
     clock_ns: Callable[[], int] = time.perf_counter_ns
+    # Dates baselines, and tells how old a stored one is at the first scan; from then on ages follow scan time.
     unix_time_s: Callable[[], float] = time.time
 
     def __post_init__(self) -> None:
@@ -232,7 +201,8 @@ class Runtime:
             raise UsageError(f"taps is {options.taps}, but model '{self.model.name}' takes {contract.taps} at most")
         self.baselines, self.mountings = dict(self.baselines), dict(self.mountings)
         self.trust = contract.read_trust()
-        self.unposed = None if contract.takes_poses else self.model.name
+        self.unposed = None if contract.takes_poses else self.model.name  # for a user who states poses all the same
+        # A newer scan keeps the place of the one it overtakes: the sensor that has waited longest is the first.
         self.waiting: dict[str, tuple[Sensor, Step, Window]] = {}
         self._sensors: dict[str, Sensor] = {}
         self._events: list[Callable[[int], Event]] = []
@@ -257,10 +227,7 @@ class Runtime:
         self._events.append(partial(Event, kind="reset", sensor=None))
 
     def zero(self, name: str | None = None, *, force: bool = False) -> None:
-        """Zero a sensor or all from the next scans, also in contact if forced; an event reports the outcome.
-
-        The old baselines stay in use until then.
-        """
+        """Zero a sensor or all from the next scans, also in contact if forced; an event reports the outcome."""
         chosen = list(self._sensors) if name is None else [name] if name in self._sensors else []
         for sensor in chosen:
             self._sensors[sensor].zero_again(force=force)
@@ -295,13 +262,10 @@ class Runtime:
         return step.freeze()
 
     def take(self, scan: Scan, clock_ns: Callable[[], int] | None = None) -> list[Result]:
-        """Take a scan and return the results that are ready, in the order of their scans.
+        """Take a scan and return the results that are ready, or raise a WindowError where it is of another geometry.
 
         A scan that needs a pattern waits for `infer`. If the next one of its sensor comes first, its result is ready
         without a pattern, and the newer scan takes its place. Results state their latency by the clock of the scans.
-
-        Raises:
-            WindowError: the scan is not of this sensor geometry.
         """
         name = scan.sensor
         if scan.counts.shape != self._scan_shape:
@@ -329,9 +293,7 @@ class Runtime:
     def infer(self, clock_ns: Callable[[], int] | None = None, *, only: str | None = None) -> list[Result]:
         """Infer the patterns of the sensors that have waited longest, MOST_TOGETHER in one call, or of one alone.
 
-        Raises:
-            ModelError: the model gave a pattern or a traction that is not finite, or a deviation that is not finite and
-                above zero.
+        Raises a ModelError where the model gave what is not finite, or a deviation that is not above zero.
         """
         due = list(map(self.waiting.pop, list(self.waiting)[:MOST_TOGETHER] if only is None else [only]))
         if not due:

@@ -1,8 +1,7 @@
 """Taps of one sensor: contact, the window of a due pattern with its poses, and where to touch next.
 
 Contact has two thresholds on the summed z, so that noise around one of them cannot split a tap. While a tap goes on
-the window holds its current frame, not its peak, so that a robot gets a pattern from the first scan of a tap. Earlier
-taps are remembered by their peaks.
+the window holds its current frame, so that a robot gets a pattern from its first scan; earlier taps have their peaks.
 """
 
 import math
@@ -23,13 +22,12 @@ from edge.perception.taxel_health import REPEATS, Health
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack
 
-MIN_TAP_SCANS: Final = 2
-"""Fewest scans of a tap. A touch in a single scan may be a flipped bit; it is reported, but not remembered as a tap."""
+MIN_TAP_SCANS: Final = 2  # a touch in a single scan may be a flipped bit: it is reported, but not remembered as a tap
 
 
 @dataclass(eq=False, slots=True)
 class TapPeak:
-    """Peak of a tap: the tap's number, when its readings (3, rows, cols) were taken, in [ns], and its pose if known."""
+    """Peak of a tap, when its readings (3, rows, cols) were taken, and its pose if known."""
 
     tap: int
     time_ns: int
@@ -38,33 +36,26 @@ class TapPeak:
 
 
 class TapTracker:
-    """Tracker of the taps of one sensor.
+    """Tracker of the taps of one sensor, for windows of K taps."""
 
-    Attributes:
-        contact: True while a tap goes on.
-        tap: number of the tap, from 0; without contact that of the last one.
-        newest: (3, rows, cols), newest readings in contact.
-        peaks: of the earlier taps, newest first: one fewer than a window has taps.
-    """
-
-    newest: NDArray[np.float32]
+    newest: NDArray[np.float32]  # readings (3, rows, cols) in contact
+    peaks: tuple[TapPeak, ...]  # of the earlier taps, newest first: one fewer than a window has taps
 
     def __init__(self, taps: int, options: RuntimeOptions) -> None:
-        """Start without contact, for windows of K taps."""
         self._earlier = taps - 1
         self._on_counts = options.contact_on_counts
         self._off_counts = options.contact_off_counts
         self._idle_reset_ns = options.idle_reset_s * 1e9
         self._peak: TapPeak | None = None
         self.contact = False
-        self.tap = -1
+        self.tap = -1  # number of the tap, from 0; without contact that of the last one
         self._last_contact_ns = 0
         self.reset()
 
     def reset(self) -> None:
         """Forget every tap. A tap in progress continues as the first one, with a new number."""
         self.tap += self.contact
-        self.peaks: tuple[TapPeak, ...] = ()
+        self.peaks = ()
         self._tap_scans = 0
         self._peak_counts = -math.inf
 
@@ -75,11 +66,10 @@ class TapTracker:
     def push(
         self, readings: NDArray[np.float32], z_counts: float, time_ns: int, taken_ns: int, *, doubted: bool = False
     ) -> None:
-        """Take the zeroed counts (3, rows, cols) of a scan with their summed z, when it arrived and was taken, in [ns].
+        """Take a scan's zeroed counts (3, rows, cols), their summed z, and when it arrived and was taken, in [ns].
 
-        The idle time is measured between scans, from the last one in contact. Time that runs backwards counts as no
-        time; a gap within a tap does not end the tap. A scan that is doubted, by `BaselineDoubt` of zeroing.py, is no
-        contact, whatever its z: this ends a tap where a pad rests.
+        The idle time counts from the last scan in contact; time that runs backwards counts as no time, and a gap within
+        a tap does not end it. A scan that is doubted is no contact, whatever its z: this ends a tap where a pad rests.
         """
         if self.contact:
             self.contact = z_counts >= self._off_counts and not doubted
@@ -112,17 +102,15 @@ class TapTracker:
             self.reset()
 
 
-_HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
-"""Four taps half a pitch apart read what lies between the taxels. A search for the place of the largest expected gain
-was worth 0.41 dB over such places at two taps and 0.08 dB at four, so it is not made."""
+_HALF_PITCH_MM: Final = USPA44.pitch_mm / 2  # four taps half a pitch apart read what lies between the taxels
 _SHIFTS_MM: Final = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]) * _HALF_PITCH_MM
 
 
 def next_shift_mm(places_mm: NDArray[np.floating], reach_mm: float) -> tuple[float, float] | None:
     """Return the shift dx, dy in [mm] from the newest tap, of half a pitch along x, y or both, to touch next.
 
-    Places (K, 2) of the taps so far are in the newest one's axes. The next one must not be further than the reach from
-    any of them that is itself in reach; None where each place was touched or is out of reach.
+    Places (K, 2) of the taps so far are in the newest one's axes, and the next one must be in reach of all that are
+    themselves in reach; None where each place was touched or is out of reach.
     """
     places_mm = places_mm[np.hypot(*places_mm.T) <= reach_mm]
     distances_mm = np.hypot(*(_SHIFTS_MM[:, None] - places_mm).transpose(2, 0, 1))
@@ -158,7 +146,6 @@ class Taps:
     ) -> None:
         self._tracker, self._health = tracker, health
         self._contract, self._report = contract, report
-        self._takes_poses = contract.takes_poses
         self._most = contract.taps if options.taps is None else options.taps
         self._scheduled = options.taps or contract.unposed_taps
         self._on_counts = options.contact_on_counts
@@ -166,7 +153,6 @@ class Taps:
         self._radius_mm = contract.pitch_mm * sqrt((contract.rows**2 + contract.cols**2 - 2) / 12)
         self._reported: deque[int] = deque(maxlen=64)  # newest taps that were left out; no window has as many
         self._strongest: tuple[int, float, PadPose | None] = -1, 0.0, None  # pattern: its tap, its summed z, its pose
-        self._proposed: tuple[tuple[TapPeak, ...], NextTap | None] = (), None  # for which taps, and what
 
     def __call__(self, step: Step, track: PoseTrack | None) -> None:
         """Take a step with readings; `track` has the poses of its pad, None if there are none."""
@@ -182,14 +168,14 @@ class Taps:
             step.state, step.contact, step.due = "contact", True, self._window(step, tap, scheduled=track is None)
         elif not step.doubted:
             step.state, step.contact = "idle", False
-            if tap.peaks and self._takes_poses:
+            if tap.peaks and self._contract.takes_poses:
                 step.next_tap = self._propose(tap.peaks)
         else:
             step.state = "baseline_in_doubt"
             if z_counts >= self._on_counts:  # to be looked at, and made from this scan alone
                 counts = np.zeros((self._contract.taps, *readings.shape), dtype=np.float32)
                 counts[0] = readings
-                rows = scheduled_rows(1, 0.0) if self._takes_poses else None
+                rows = scheduled_rows(1, 0.0) if self._contract.takes_poses else None
                 step.due = Window(counts, 1, (0,), rows, NO_TAP, (NO_TAP, step.filled))
 
     def see(self, tap: int, z_counts: float, pose: PadPose | None, taps_used: int) -> None:
@@ -198,7 +184,7 @@ class Taps:
             self._strongest = tap, z_counts, pose if taps_used < self._most else None
 
     def _window(self, step: Step, tap: TapTracker, *, scheduled: bool) -> Window:
-        if self._takes_poses:
+        if self._contract.takes_poses:
             slots, rows = self._choose(tap, step.pose, scheduled=scheduled)
             slots, rows = tuple(slots[: self._most]), rows[: self._most]
             taps = len(slots)
@@ -216,10 +202,7 @@ class Taps:
     def _choose(
         self, tap: TapTracker, pose: PadPose | None, *, scheduled: bool
     ) -> tuple[Sequence[int], NDArray[np.float32]]:
-        """Return the taps to use during contact: places in the window, newest first, and their poses as model input.
-
-        The pose is that of the newest tap's pad at this scan; without poses taps follow the paper's schedule.
-        """
+        """Return the taps to use during contact: places in the window, newest first, and their poses as model input."""
         if scheduled:
             taps = min(1 + len(tap.peaks), self._scheduled)
             return range(taps), scheduled_rows(taps, self._contract.angle_step_deg)
@@ -250,16 +233,11 @@ class Taps:
             self._report(kind, why)
 
     def _propose(self, peaks: tuple[TapPeak, ...]) -> NextTap | None:
-        """Return where to touch next, the same for the same taps; None where no tap is to follow the newest."""
+        """Return where to touch next; None where no tap is to follow the newest."""
         tap, _, newest = self._strongest
         if newest is None or tap != peaks[0].tap:
             return None
-        if peaks is not self._proposed[0]:
-            seen = [
-                newest.seen_from(newest),
-                *(one.pose.seen_from(newest) for one in peaks[1:] if one.pose is not None),
-            ]
-            shift_mm = next_shift_mm(np.array([(pose.x_mm, pose.y_mm) for pose in seen]), self._contract.reach_mm)
-            proposed = None if shift_mm is None else NextTap(*shift_mm, 0.0, _reached(newest, *shift_mm))
-            self._proposed = peaks, proposed
-        return self._proposed[1]
+        poses = [newest, *(peak.pose for peak in peaks[1:] if peak.pose is not None)]
+        seen = [pose.seen_from(newest) for pose in poses]
+        shift_mm = next_shift_mm(np.array([(pose.x_mm, pose.y_mm) for pose in seen]), self._contract.reach_mm)
+        return None if shift_mm is None else NextTap(*shift_mm, 0.0, _reached(newest, *shift_mm))

@@ -1,9 +1,4 @@
-"""Health of a sensor's taxels, scan by scan: held readings, dead taxels, their reasons, and estimates of dead ones.
-
-For an estimate readings are modelled as drawn from one of several kinds of contact, each a zero-mean Gaussian of any
-scale: the edge of a figure, a face over the whole pad. The living taxels give the probability of each kind, and each
-kind an estimate.
-"""
+"""Health of a sensor's taxels, scan by scan: held readings, dead taxels, their reasons, and estimates of dead ones."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,37 +17,26 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import TAXEL_SILENT_SCANS
 from firmware_bridge.zeroing.baseline import Baseline, deformation
 
-HOLD_SCANS: Final = 5
-"""Scans for which a taxel that is missing from a torn scan keeps its last reading: 50 ms at 100 Hz."""
+HOLD_SCANS: Final = 5  # for which a taxel that is missing from a torn scan keeps its last reading
+# Longest time that a reading is held from when it was taken: what was pressed half a second ago is another press. It
+# may have arrived 60 ms before its scan's end, the longest pause inside one: none that is held is older than 150 ms.
 HOLD_NS: Final = 90_000_000
-"""Longest time that a reading is held, in [ns] from scan to scan, however few scans arrived meanwhile: what was pressed
-half a second ago is another press. A reading may have arrived 60 ms before the end of its scan, the longest pause
-inside one, so no held reading is older than 150 ms. The time counts from when the reading was taken, since a reader
-that was kept from running cannot date its arrival."""
+# Repeats of a taxel in a row, while a quarter of the taxels are new, that make a pattern doubtful, and the taxel stuck:
+# no run in real grips, which are as torn at their source, is longer than 3.
 REPEATS: Final = 5
-"""Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
-longer than 3."""
 STUCK_SCANS: Final = 20
-"""Repeats of a taxel in a row that make it stuck. A living taxel sends the same three counts twice in a quarter of the
-scans in which a quarter of the taxels are new, as torn as real grips are at their source, and no run there is longer
-than 3. If scans were independent, twenty in a row would come once in decades at 100 Hz; with noise of two counts
-alone, which repeats one scan in 350, never."""
-FROZEN_SENSOR_SCANS: Final = 10
-"""Scans bit for bit alike in all taxels: with noise of two counts 48 equal values do not come twice."""
+FROZEN_SENSOR_SCANS: Final = 10  # scans alike in all taxels: with noise of two counts 48 equal values do not come twice
+# Scans without a new count of a taxel, whatever the others do: most are stuck, or one old scan is sent for ever. A
+# server that sends 507 scans a second, of a sensor that renews a taxel four times, reaches 127.
 FROZEN_SCANS: Final = 300
-"""Scans without a new count of a taxel, whatever the others do: most are stuck at once, or one old scan is sent for
-ever. A server that sends 507 scans a second, of a sensor that renews a taxel four times, reaches 127."""
 FAR_SCANS: Final = 20
-BACK_SCANS: Final = 10
-"""Good scans after which a dead taxel counts as alive again, so that an intermittent one does not flicker."""
-RANGE_ENDS: Final = (0, 65535)
-"""Ends of a chip's range. A count there has left the range and is not a reading, unless the taxel rests nearby and
-wraps round."""
+BACK_SCANS: Final = 10  # good scans after which a dead taxel is believed again, so that none flickers
+RANGE_ENDS: Final = (0, 65535)  # of a chip: a count there is no reading, unless the taxel rests nearby and wraps round
 NEAR_END_COUNTS: Final = 500.0
 LONE_COUNTS: Final = 1500.0  # size of a reading from which a lone taxel is checked: as large as a contact
+# Share of the largest taxel's reading that the second largest reaches in any contact: at least 0.030 with a small
+# sphere on one taxel alone, 0.063 on simulated taps, 0.67 on real grips.
 LONE_SHARE: Final = 0.015
-"""Share of the largest taxel's reading that the second largest reaches in any contact: at least 0.030 with a small
-sphere on one taxel alone, 0.063 on simulated taps, 0.67 on real grips."""
 REST_COUNTS: Final = 500.0  # reading below which a taxel that was far from rest is believed again
 REASONS: Final = ("silent", "saturated", "stuck", "far", "unzeroed")
 SILENT, SATURATED, STUCK, FAR, UNZEROED = range(1, 6)
@@ -66,39 +50,32 @@ _WORDS: Final = {
     "unzeroed": "not zeroed",
 }
 _OVERLOADED: Final = ": overloaded, too near a magnet, or broken"
+# Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of validation's pixels.
 WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
-"""Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of pixels of validation
-presses. They may be too small on contacts unlike those of training."""
+
+
+Fill = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
 class Health:
     """Stage: the newest reading of each taxel over the baseline, which taxels are dead, and estimates of those.
 
     A taxel is dead while it is silent or saturated for longer than its last reading is held; stuck, when it repeats
-    itself while most others do not; far, when it reads what no contact makes; or was not heard while zeroing. It is
-    believed again after BACK_SCANS good scans. A taxel that is stuck only nearly, or wrong in a way that a contact
-    could be, is not found: a small sphere on one taxel looks to its neighbours like a fault. Without an estimator there
-    is no pattern while a taxel is dead.
-
-    Attributes:
-        held: (3, rows, cols), the newest reading of each taxel.
-        dead: taxels (rows, cols) that are not believed; another array only where they are others than before.
-        reasons: dead taxels, row-major from the top left, and one of REASONS for each.
-        sound: every taxel is believed, and nothing speaks against one.
-        most_repeats: scans for which a taxel that is believed has repeated itself while a quarter of the others were
-            new.
+    itself while most others do not; far, when it reads what no contact makes; or was not heard while zeroing. One that
+    is wrong in a way that a contact could be is not found: a small sphere on it looks to its neighbours like a fault.
     """
 
     def __init__(
         self,
         grid_shape: tuple[int, int],
         mounting: Mounting | None = None,
-        estimator: "TaxelEstimator | None" = None,
+        estimator: NDArray[np.float64] | None = None,
     ) -> None:
-        """Start with no reading of a grid (rows, cols); without a mounting its axes are as wired."""
+        """Start with no reading of a grid (rows, cols); without an estimator dead taxels allow no pattern."""
         self._mounting, self._estimator = mounting, estimator
-        self._fill: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None
-        self.held: NDArray[np.int32] = np.zeros((3, *grid_shape), dtype=np.int32)
+        self._fill: Fill | None = None
+        self.held: NDArray[np.int32] = np.zeros((3, *grid_shape), dtype=np.int32)  # newest reading of each taxel
+        # The dead are another array only where they are others than before.
         self.dead, self._arrived, self._saturated, self._unzeroed = np.zeros((4, *grid_shape), dtype=bool)
         # Scans since a taxel arrived, in which it repeated itself, was far, was well, and gave no new count.
         self._age, self._still, self._far, self._well, self._old = np.zeros((5, *grid_shape), dtype=np.int64)
@@ -107,9 +84,9 @@ class Health:
         self._whole_ns = 0
         self._repeats = 0
         self._baseline: Baseline | None = None
-        self.sound = False
-        self.most_repeats = 0
-        self.reasons: dict[int, str] = {}
+        self.sound = False  # every taxel is believed, and nothing speaks against one
+        self.most_repeats = 0  # of a taxel that is believed
+        self.reasons: dict[int, str] = {}  # one of REASONS for each dead taxel, row-major from the top left
 
     @property
     def silent_long(self) -> NDArray[np.bool_]:
@@ -153,7 +130,7 @@ class Health:
         if self.dead is dead:
             return False
         possible = 0 < 2 * np.count_nonzero(self.dead) <= dead.size
-        self._fill = self._estimator.filler(self.dead) if self._estimator is not None and possible else None
+        self._fill = filler(self._estimator, self.dead) if self._estimator is not None and possible else None
         return True
 
     def fill(self, step: Step) -> None:
@@ -171,7 +148,7 @@ class Health:
             step.readings, step.force_counts = readings, float(np.add.reduce(readings[2], axis=None))
 
     def _notes(self, filled: str | None) -> list[Note]:
-        """Return notes on taxels that are not believed, of which there are estimates or, with None, no pattern."""
+        """Return notes on taxels that are not believed; filled is None where that leaves no pattern."""
         notes: list[Note] = []
         overloaded = np.flatnonzero(self._saturated & ~self.dead)
         if overloaded.size:
@@ -281,42 +258,25 @@ def _named(taxels: list[int] | NDArray[np.integer]) -> str:
     return f"taxel {', '.join(map(str, taxels))}"
 
 
-class TaxelEstimator:
-    """Estimator of dead taxels of a grid (rows, cols), fitted on readings of simulated presses.
+def filler(covariances: NDArray[np.float64], dead: NDArray[np.bool_]) -> Fill:
+    """Return what puts estimates in the place of dead taxels (rows, cols), not all, into scans of zeroed counts.
 
-    Covariances (kinds, 3 taxels, 3 taxels) are of zeroed counts about zero, of any scale, x of all taxels first,
-    row-major, then y, z.
-
-    Raises:
-        EdgeError: the covariances are of another grid.
+    Readings are modelled as drawn from one of several kinds of contact, each a zero-mean Gaussian of any scale. The
+    living taxels give the probability of each kind, and each kind, by its covariances of all channels, an estimate.
     """
+    off = np.tile(dead.ravel(), len(AXES))
+    lost, live = np.flatnonzero(off), np.flatnonzero(~off)
+    living = covariances[:, live[:, None], live]
+    kinds = Kinds(living)
+    maps = np.linalg.solve(living, covariances[:, live[:, None], lost]).transpose(0, 2, 1)
 
-    def __init__(self, covariances: NDArray[np.floating], grid_shape: tuple[int, int]) -> None:
-        channels = len(AXES) * grid_shape[0] * grid_shape[1]
-        if covariances.shape[1:] != (channels, channels):
-            raise EdgeError(
-                f"covariances are {covariances.shape}, expected (n, {channels}, {channels}): freeze them again"
-            )
-        self._covariances = ridged(covariances.astype(np.float64))
+    def fill(zeroed: NDArray[np.float32]) -> NDArray[np.float32]:
+        readings = zeroed.ravel()[live].astype(np.float64)
+        counts = zeroed.copy()
+        counts.flat[lost] = kinds.weigh(readings[None])[0] @ (maps @ readings)
+        return counts
 
-    def filler(self, dead: NDArray[np.bool_]) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
-        """Return what puts estimates in the place of `dead` taxels (rows, cols), not all, into scans of zeroed counts.
-
-        All that does not depend on the readings is computed once.
-        """
-        off = np.tile(dead.ravel(), len(AXES))
-        lost, live = np.flatnonzero(off), np.flatnonzero(~off)
-        living = self._covariances[:, live[:, None], live]
-        kinds = Kinds(living)
-        maps = np.linalg.solve(living, self._covariances[:, live[:, None], lost]).transpose(0, 2, 1)
-
-        def fill(zeroed: NDArray[np.float32]) -> NDArray[np.float32]:
-            readings = zeroed.ravel()[live].astype(np.float64)
-            counts = zeroed.copy()
-            counts.flat[lost] = kinds.weigh(readings[None])[0] @ (maps @ readings)
-            return counts
-
-        return fill
+    return fill
 
 
 class Kinds:
@@ -344,14 +304,13 @@ def ridged(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     return covariances + ridges[:, None, None] * np.eye(covariances.shape[1])
 
 
-def load_estimator(path: Path, grid_shape: tuple[int, int]) -> TaxelEstimator:
-    """Load the covariances that `train.freeze` computed from simulated presses.
-
-    Raises:
-        EdgeError: the file cannot be read, or is of another grid.
-    """
+def load_estimator(path: Path, grid_shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Load the covariances (kinds, 3 taxels, 3 taxels) that `train.freeze` has made, or raise an EdgeError."""
+    channels = len(AXES) * grid_shape[0] * grid_shape[1]
     try:
         covariances = read_npz(path, ["covariances"], 1 << 24)["covariances"]
+        if covariances.shape[1:] != (channels, channels):
+            raise ValueError(f"covariances are {covariances.shape}, expected (n, {channels}, {channels})")
     except (OSError, ValueError, KeyError) as error:
         raise EdgeError(f"{path} cannot be read ({error}): make it with 'python -m train.freeze'") from error
-    return TaxelEstimator(covariances, grid_shape)
+    return ridged(covariances.astype(np.float64))

@@ -2,14 +2,12 @@
 
 Three things are asked of each pattern: do its readings look like those of any contact (a magnet, a wrong id map or axis
 do not), does it explain them, and is the model itself sure of it? Of each earlier tap: does it belong to the contact
-that goes on? What repeats over contacts speaks against the sensor, not the contact. The limits are one for all models,
-so that the same reading gets the same verdict as far as their patterns agree; those of strange readings and of earlier
-taps travel in the model, from `train.trust`, UNFAMILIAR and FOREIGN.
+that goes on? What repeats over contacts speaks against the sensor, not the contact. The limits are one for all models;
+those of strange readings and of earlier taps travel in the model, from `train.trust`, UNFAMILIAR and FOREIGN.
 """
 
 import math
 import sys
-from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -26,33 +24,16 @@ from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 from firmware_bridge.sensor_file.model import with_scale
 
 LEAST_COUNTS: Final = 100.0  # largest z of the weakest contact that is checked: below it, drift is half of the reading
-MOST_MISMATCH: Final = 0.8
-"""Mismatch from which a pattern does not explain its readings: nine in ten of another press's patterns exceed it, and
-one in 300 right ones."""
+MOST_MISMATCH: Final = 0.8  # nine in ten of another press's patterns exceed it, and one in 300 right ones
+# Doubt, at a strongest z of 1000 counts, beyond which the model is not sure. With the other checks 3.5 % of simulated
+# contacts less than 30 % off are not believed, and 34 % of those over 50 % off.
 MOST_DOUBT: Final = 0.61
-"""RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
-
-With the others 3.5 % of simulated contacts less than 30 % off are not believed, and 34 % of those over 50 % off."""
-SUSPECTED: Final = "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
+SUSPECTED: Final = "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
 
 
 class SensorPad:
-    """Constants and gains of a sensor, which may be learned while it runs.
-
-    Attributes:
-        counts_per_newton: of the sensor, if known; it stands for those that the pad lacks.
-        pad: as it was given; None if nothing is known.
-        row: the constants as model input.
-        outside: it is far outside those of the training.
-        operator: of the model's checks for this pad, from a pattern and its traction to readings; None without checks.
-        gain_error: standard deviation that remains of the gains.
-        counts_per_unit: (3, rows or 1, cols or 1), counts of a network unit, with the gains that the model wants out.
-        gains_certainty: of these gains; None without.
-        wrench_origin: whether the model gets the sensor's counts per newton.
-        scale_error: how far its counts per newton may be off, as a share of them, at an end of their 90 % interval; of
-            all sensors that the model was trained for where it takes none of its own, None where they have no interval.
-    """
+    """Constants and gains of a sensor, which may be learned while it runs."""
 
     def __init__(
         self,
@@ -62,15 +43,16 @@ class SensorPad:
         counts_per_newton: float | None,
         interval: tuple[float, float] | None = None,
     ) -> None:
-        self._interval = interval  # of these counts per newton
+        self._interval = interval  # of these counts per newton, which stand for those that the pad lacks
         self.counts_per_newton, self._contract, self._trust = counts_per_newton, contract, trust
         self.use(pad)
 
     def use(self, pad: Pad | None) -> None:
-        """Take a pad from now on, converted once for all runs of the model."""
+        """Take a pad, converted once for all runs of the model."""
         contract, self.pad = self._contract, pad
         pad = with_scale(pad, self.counts_per_newton, self._interval)
         self.row: NDArray[np.float32] = contract.pad_row(pad)
+        # (3, rows or 1, cols or 1), with the gains that the model wants out
         self.counts_per_unit = np.asarray(contract.counts_per_unit, dtype=np.float32)[:, None, None]
         if contract.takes_gains and pad is not None and pad.gains is not None:
             gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
@@ -82,7 +64,7 @@ class SensorPad:
         self.operator = None if self._trust is None else self._trust.forward.of_pad(self.row[: len(taken)])
         per_newton = None if pad is None else pad.counts_per_newton
         self.wrench_origin: WrenchOrigin = "nominal"
-        self.scale_error: float | None = None
+        self.scale_error: float | None = None  # share by which counts per newton may be off, by their 90 % interval
         if "counts_per_newton" in taken:
             at = taken.index("counts_per_newton")
             _, centre, spread = contract.pad_inputs[at]
@@ -113,7 +95,6 @@ class PatternCheck:
         pad: SensorPad | None = None,
         report: Report = lambda kind, detail="": None,
     ) -> None:
-        """Check with the pad that is in use, None for one of which nothing is known."""
         self._trust, self._report = trust, report
         self._pad = SensorPad(contract, trust, None, None) if pad is None else pad
         self._unit_counts = contract.counts_per_unit[2]
@@ -130,12 +111,8 @@ class PatternCheck:
     def belonging(
         self, window: NDArray[np.float32], taps: int, poses: NDArray[np.float32] | None = None
     ) -> list[float]:
-        """Return how little each earlier tap belongs to the newest one: 0 to 1, and from 0.5 it does not.
-
-        The window is (K, 3, rows, cols) in network units, newest first, of so many taps; poses (K, 5) as model input.
-        Taps of a model that takes no poses are not checked.
-        """
-        if taps < 2 or poses is None:
+        """Return how little each earlier tap of a window in network units belongs to the newest, 0 to 1."""
+        if taps < 2 or poses is None:  # a model that takes no poses has no such check
             return []
         check, features = self._trust.tap, pose_tap_features(window[:taps], poses[:taps])
         return [_share(score - check.limit) for score in check.network(features)]
@@ -146,10 +123,12 @@ class PatternCheck:
         """Return the numbers of the taps of a window that belong to the contact, and how little each earlier one does.
 
         A press nearly as strong as an earlier one settles it, and the tracker forgets that tap; a lighter one may only
-        have begun. `scaled` is the window in network units, (K, 3, rows, cols), `posed` as in `foreign_taps`.
+        have begun.
         """
         belonging = tuple(self.belonging(scaled, window.taps, window.poses))
-        dropped = foreign_taps(belonging, posed=posed)
+        dropped = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
+        if dropped and not posed:  # the taps before it go, too: their turns are counted over it
+            dropped = list(range(dropped[0], window.taps))
         forgotten = [
             number
             for number in (dropped if posed else dropped[:1])
@@ -172,11 +151,9 @@ class PatternCheck:
         traction: NDArray[np.float32] | None,
         repeats: int,
     ) -> TrustVerdict:
-        """Return the verdict on a contact's pattern, and remember what the contact shows of the sensor.
+        """Return the verdict on a contact's pattern (H, W), and remember what the contact shows of the sensor.
 
-        Readings (3, rows, cols) are in network units, the pattern (H, W) in [mm], its doubt as `intervals.doubt` gives
-        it, the traction (3, h, w) in [kPa]; repeats are scans for which some taxel has repeated itself while most
-        others were new.
+        Readings (3, rows, cols) are in network units, the doubt is that of `intervals.doubt`, repeats are of `Health`.
         """
         strength = float(newest[2].max())
         z_counts = strength * self._unit_counts
@@ -221,15 +198,6 @@ class PatternCheck:
                 self.suspected = suspected
                 self._report("suspected" if suspected else "cleared", SUSPECTED if suspected else "")
         self._tap, self._strongest = tap, -math.inf
-
-
-def foreign_taps(belonging: Sequence[float], *, posed: bool) -> list[int]:
-    """Return the numbers, from 1, of the earlier taps that a pattern is made without, by `PatternCheck.belonging`.
-
-    A tap with a pose of its own goes alone. Without poses the taps before it go, too: their turns are counted over it.
-    """
-    foreign = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
-    return foreign if posed or not foreign else list(range(foreign[0], len(belonging) + 1))
 
 
 def _alternates(z: NDArray[np.float32]) -> bool:

@@ -1,9 +1,8 @@
 """Stages that know a sensor's rest level: its baseline, taken or stored, and its drift; and whether to believe it.
 
-The shape of a reading does not tell whether it is a touch, or whether drift or an old baseline explains it as well: a
-flat grip moves all taxels together, and so does a pad that has warmed, or is another one than was zeroed. What tells is
-how it began. A touch is quick, and begins from a rest level that was seen in this run; or it is local, and leaves half
-of the pad at rest. All else over a threshold is in doubt.
+A flat grip moves all taxels together, and so does a pad that has warmed, or is another one than was zeroed. What tells
+is how it began. A touch is quick, and begins from a rest level that was seen in this run; or it is local, and leaves
+half of the pad at rest. All else over a threshold is in doubt.
 """
 
 from collections.abc import Callable
@@ -24,8 +23,7 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator, Origin, deformation
 from firmware_bridge.zeroing.drift_tracker import Drift, DriftTracker
 
-GIVE_UP_NS: Final = 15_000_000_000
-"""Longest zeroing on demand, in [ns] of scan time: ten tries at 100 Hz, and four at 30 Hz."""
+GIVE_UP_NS: Final = 15_000_000_000  # longest zeroing on demand: ten tries at 100 Hz, and four at 30 Hz
 
 
 class Demand(NamedTuple):
@@ -38,16 +36,7 @@ class Demand(NamedTuple):
 
 
 class Zeroing:
-    """Stage: puts the newest readings over the baseline, takes a new one where it is due, and lets it follow drift.
-
-    It reports the outcome of zeroing on demand, and steps in the rest level; `notes` tell why there is no baseline at
-    the start.
-
-    Attributes:
-        baseline: subtracted from the scans, drift and all; None before there is one.
-        notes: why there is no baseline yet, and how a zeroing on demand stands.
-        drift_notes: what has become of the rest level.
-    """
+    """Stage: puts the newest readings over the baseline, takes a new one where it is due, and lets it follow drift."""
 
     def __init__(
         self,
@@ -58,10 +47,10 @@ class Zeroing:
         unix_time_s: Callable[[], float],
         notes: tuple[Note, ...] = (),
     ) -> None:
-        self.baseline: Baseline | None = None
+        self.baseline: Baseline | None = None  # with the drift that was followed
         self._taps, self._health, self._mounting = taps, health, mounting
         self._report, self._unix_time_s = report, unix_time_s
-        self.notes = notes
+        self.notes = notes  # why there is no baseline yet, and how a zeroing on demand stands
         self._drift: Drift | None = None
         self.drift_notes: tuple[Note, ...] = ()
         self._estimator = BaselineEstimator(clock=unix_time_s)
@@ -107,15 +96,13 @@ class Zeroing:
             self._report("rest_level", event)
 
     def zero_again(self, *, force: bool, doubted: bool) -> None:
-        """Take a new baseline from the next scans, with an event for the outcome; the old one stays in use until then.
-
-        It is forced also in contact; one in doubt says nothing of a load.
-        """
+        """Take a new baseline from the next scans, forced also in contact; the old one stays in use until then."""
         if self.baseline is None:
             self._report("zeroing")
         elif self._taps.contact and not force:
             self._report("in_contact")
         else:
+            # A baseline in doubt says nothing of a load.
             self._demand = Demand(force, None if force or doubted else self.baseline)
             self._begin()
             self.notes = (Note("zeroing", "zeroing: keep the pad still and free"),)
@@ -137,11 +124,7 @@ class Zeroing:
         self._report("given_up", why)
 
     def _take(self, scan: Scan) -> Baseline | None:
-        """Use the scan for a new baseline; after a refusal a note reports it and zeroing starts over.
-
-        On demand a tap that goes on starts it over unless it is forced, and after a time it is given up: the old
-        baseline stays.
-        """
+        """Use the scan for a new baseline; a refusal, also by a tap that goes on, starts it over."""
         demand = self._demand
         if demand is not None and demand.end_ns is None:
             self._demand = demand = demand._replace(end_ns=scan.time_ns + GIVE_UP_NS)
@@ -166,15 +149,10 @@ class Zeroing:
         return replace(new, origin="demand")
 
 
-Doubt = Literal["unseen", "outage", "held", "below", "slow", "alike", "left"]
-"""Why readings are no contact: the pad was not seen at rest near its baseline in this run, or since an outage; the
-recording that is played may hold something all the time; it reads far below its baseline; the readings rose no faster
-than drift; all taxels changed alike, as in a field; or it is what a release has left, which warming and recovery
-explain."""
-
+Doubt = Literal["unseen", "outage", "held", "below", "slow", "alike", "left"]  # why readings are no contact
+# Largest reading of a taxel at rest, on any axis: more than a pad turned over in the earth's field (36) and the first
+# recovery after a grip (45), and less than the change of any public recording's rest level in four hours (64 to 715).
 NEAR_COUNTS: Final = 50.0
-"""Largest reading of a taxel at rest, on any axis: more than a pad turned over in the earth's field (36) and the first
-recovery after a grip (45), and less than the change of any public recording's rest level in four hours (64 to 715)."""
 SEEN_SHARE: Final = 0.75  # share of the taxels at rest by which the pad is seen at rest
 LOCAL_SHARE: Final = 0.5  # share of the taxels at rest beside which the others are touched
 _TEXTS: Final[dict[Doubt, str]] = {
@@ -188,21 +166,8 @@ _TEXTS: Final[dict[Doubt, str]] = {
 }
 
 
-def doubt_text(doubt: Doubt, counts: tuple[float, float, float], age_s: float | None) -> str:
-    """Return a doubt in a user's words, with the medians of all taxels on x, y, z and the baseline's age in [s]."""
-    seen = "x {:+.0f}, y {:+.0f}, z {:+.0f} counts".format(*counts)
-    age = "of unknown age" if age_s is None else f"{age_text(age_s)} old"
-    return f"baseline in doubt: {_TEXTS[doubt].format(counts=seen)} (baseline {age}); free the pad and zero again"
-
-
 class BaselineDoubt:
-    """Stage: decides whether a step's readings may be a touch, and reports when a doubt begins, changes and ends.
-
-    Attributes:
-        doubt: why the newest readings are in doubt; None if they are not.
-        counts: medians of all taxels on x, y, z when that began.
-        reported: the doubt of the newest step that was judged; `notes` state it for the user.
-    """
+    """Stage: decides whether a step's readings may be a touch, and reports when a doubt begins, changes and ends."""
 
     def __init__(self, options: RuntimeOptions, taxels: int, report: Report) -> None:
         self._report = report
@@ -213,7 +178,7 @@ class BaselineDoubt:
         # warming by 3 K gives 120.
         self._drift_per_ns = 40.0 * taxels / 1e9
         self._left = 150.0 * taxels
-        self.counts = (0.0, 0.0, 0.0)
+        self.counts = (0.0, 0.0, 0.0)  # medians of all taxels on x, y, z when the doubt began
         self.begin("file")
 
     def begin(self, origin: Origin) -> None:
@@ -248,12 +213,14 @@ class BaselineDoubt:
         if doubt is None:
             self._report("baseline_cleared", "")
         else:
-            text = doubt_text(doubt, self.counts, step.baseline_age_s)
+            why = _TEXTS[doubt].format(counts="x {:+.0f}, y {:+.0f}, z {:+.0f} counts".format(*self.counts))
+            age = age_text(step.baseline_age_s)
+            text = f"baseline in doubt: {why} (baseline {age}); free the pad and zero again"
             self.notes = (Note("baseline_in_doubt", text),)
             self._report("baseline_doubted", text)
 
     def _weigh(self, zeroed: NDArray[np.float32], z_counts: float, time_ns: int) -> Doubt | None:
-        """Return why readings (3, rows, cols) over the baseline, of a summed z, are in doubt; None if they are not."""
+        """Return why readings (3, rows, cols) over the baseline, with their summed z, are in doubt."""
         self._newest = zeroed
         if self._held:
             return "held"
@@ -297,7 +264,7 @@ class BaselineDoubt:
     def _explanation(
         self, zeroed: NDArray[np.float32], z_counts: float, time_ns: int, before: Doubt | None
     ) -> Doubt | None:
-        """Return what explains readings of most taxels over a confirmed baseline as well as a touch."""
+        """Return what explains readings of most taxels over a baseline that was seen as well as a touch."""
         if not self._touched:
             rise = self._drift_per_ns * max(time_ns - self._newest_ns, 0)
             self._level = min(z_counts, self._level + rise)

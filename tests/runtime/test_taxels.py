@@ -1,21 +1,17 @@
 """Dead taxels: detected, named, held for a while, trusted again; what is not one; and estimates of their readings."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from bridge_samples import REAL_RECORDINGS
 from chaos_judge import HELD_CYCLES, RATE_HZ
 from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
-from numpy.typing import NDArray
 from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.api import USPA44, Baseline, EdgeError, demo_recording
 from edge.inference.bundled import TAXELS
 from edge.perception import taxel_health as health
-from edge.perception.event import joined
-from edge.perception.result import Step
 from edge.perception.taxel_health import (
     BACK_SCANS,
     FAR_SCANS,
@@ -23,52 +19,40 @@ from edge.perception.taxel_health import (
     STUCK_SCANS,
     TAXEL_SILENT_SCANS,
     WIDENING,
-    Health,
-    TaxelEstimator,
+    filler,
     load_estimator,
+    ridged,
 )
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
 
-SPHERE_SHARE = 0.030
-"""Reading of the largest neighbour as a share of the taxel under a sphere of 1.5 mm, simulated."""
-
-
-def followed(watch, scan, baseline):
-    """Return the step of a scan after the stage."""
-    step = Step(scan, "device", "m", "mm")
-    watch(step, baseline)
-    watch.fill(step)
-    return step
+ESTIMATOR = load_estimator(TAXELS, (4, 4))
 
 
 class Pad:
-    """A watched pad with noise; `faults` change a scan's counts (3, 16) in place."""
+    """A pad with noise; `faults` change a scan's counts (3, 16) in place."""
 
     def __init__(self, baseline=BASELINE, seed=0, noise_counts=2.0):
-        self.watch = Health((4, 4), estimator=load_estimator(TAXELS, (4, 4)))
-        self._baseline = baseline
-        self._series = ScanSeries("4", USPA44)
-        self._rng = np.random.default_rng(seed)
-        self._noise_counts = noise_counts
-        self._number = 0
+        self._runtime = make_runtime(baselines={"4": baseline}, estimator=ESTIMATOR)
+        self._series, self._rng, self._noise_counts = ScanSeries("4", USPA44), np.random.default_rng(seed), noise_counts
+        self._time_ns = 0
+
+    def push(self, counts, later_ns=PERIOD_NS):
+        """Return the reasons after a scan."""
+        self._time_ns += later_ns
+        self.result = self._runtime.push(self._series.close(counts.astype(np.int32), self._time_ns))
+        return dict(self.result.dead)
 
     def read(self, scans, *faults):
-        """Reasons after each of so many scans."""
+        """Return the reasons after each of so many scans."""
         told = []
         for _ in range(scans):
-            counts = REST + np.rint(self._rng.normal(0, self._noise_counts, REST.shape)).astype(np.int32)
+            counts = np.rint(REST + self._rng.normal(0, self._noise_counts, REST.shape))
             for fault in faults:
                 fault(counts.reshape(3, 16))
-            self._number += 1
-            self.step = followed(self.watch, self._series.close(counts, self._number * PERIOD_NS), self._baseline)
-            told.append(dict(self.watch.reasons))
+            told.append(self.push(counts))
         return told
-
-    @property
-    def note(self):
-        return joined(self.step.notes) or ""
 
 
 def at(taxel, *readings):
@@ -111,27 +95,23 @@ class TestWatch:
     )
     def test_a_dead_taxel_is_named_and_believed_after_good_scans(self, fault, reason, after):
         pad = Pad()
-        assert not any(pad.read(50))
-        assert pad.read(after, fault) == [{}] * after
+        assert not any(pad.read(50) + pad.read(after, fault))
         assert pad.read(30, fault) == [{7: reason}] * 30
-        assert pad.watch.dead.ravel().tolist() == [taxel == 7 for taxel in range(16)]
         back = pad.read(BACK_SCANS + 5)
         assert back[: BACK_SCANS - 1] == [{7: reason}] * (BACK_SCANS - 1) and back[-1] == {}
 
-    @pytest.mark.parametrize(("fault", "reason"), [(silent(3), "silent"), (at(3, 1, 2, 3), "stuck")])
-    def test_one_that_comes_and_goes_does_not_flicker(self, fault, reason):
+    def test_one_that_comes_and_goes_does_not_flicker(self):
         pad = Pad()
-        pad.read(5)
-        pad.read(40, fault)
+        pad.read(45, at(3, 1, 2, 3))
         for _ in range(10):
-            assert pad.read(BACK_SCANS - 2) + pad.read(2, fault) == [{3: reason}] * BACK_SCANS
+            assert pad.read(BACK_SCANS - 2) + pad.read(2, at(3, 1, 2, 3)) == [{3: "stuck"}] * BACK_SCANS
 
     def test_a_sensor_that_repeats_one_scan_is_frozen_after_ten(self):
         pad = Pad(noise_counts=0)
         assert not any(pad.read(health.FROZEN_SENSOR_SCANS))
         assert pad.read(1) == [dict.fromkeys(range(16), "stuck")]
-        assert pad.step.readings is None
-        assert pad.note == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
+        assert pad.result.state == "incomplete"
+        assert pad.result.note == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
 
     @pytest.mark.parametrize(
         ("stuck", "after"), [(1, STUCK_SCANS), (8, STUCK_SCANS), (12, STUCK_SCANS), (13, health.FROZEN_SCANS)]
@@ -142,7 +122,7 @@ class TestWatch:
         told = pad.read(after + 5, *(at(taxel, *STUCK) for taxel in range(stuck)))
         # A living taxel repeats itself now and then, and with few of them a scan then shows nothing.
         assert not any(told[:after]) and told[-1] == dict.fromkeys(range(stuck), "stuck")
-        assert (pad.step.filled == "neighbours") == (stuck <= 8)
+        assert (pad.result.filled == "neighbours") == (stuck <= 8)
 
     def test_the_dead_do_not_count_among_those_that_should_be_new(self):
         pad = Pad()
@@ -161,46 +141,32 @@ class TestWatch:
     def test_a_taxel_without_reading_or_rest_is_never_believed(self):
         pad = Pad()
         pad.read(1, silent(2))
-        assert pad.step.readings is None and not pad.step.dead
-        assert pad.read(HOLD_SCANS, silent(2))[-1] == {2: "silent"} and pad.step.filled == "neighbours"
+        assert pad.result.state == "incomplete" and not pad.result.dead
+        assert pad.read(HOLD_SCANS, silent(2))[-1] == {2: "silent"} and pad.result.filled == "neighbours"
         counts = BASELINE.counts.copy()
         counts[:, 1, 2] = np.nan
         assert Pad(Baseline.of("4", counts, 0.0, 100, "start-up")).read(50)[-1] == {6: "unzeroed"}
 
-    @pytest.mark.parametrize("taxel", [0, 5, 15])
-    def test_a_small_sphere_on_one_taxel_is_not_a_fault(self, taxel):
-        assert not any(Pad().read(3 * FAR_SCANS, pressed(taxel, 3000, share=SPHERE_SHARE)))
-
-    def test_noise_raises_nothing(self):
-        """In an hour no taxel came nearer to stuck than four scans in a row."""
+    def test_neither_a_small_sphere_nor_noise_is_a_fault(self):
+        """The sphere's largest neighbour reads 0.030 of it, simulated."""
+        assert not any(Pad().read(3 * FAR_SCANS, pressed(5, 3000, share=0.030)))
         assert not any(Pad(seed=3).read(3000))
 
     def test_no_reading_is_held_for_too_long(self):
         """A pause, the longest that a scan may have, may lie between a reading and the end of its own scan."""
         assert (health.HOLD_NS + LONGEST_PAUSE_NS) / 1e9 <= HELD_CYCLES / RATE_HZ
 
-    @pytest.mark.parametrize(("pause_ns", "held"), [(health.HOLD_NS, True), (health.HOLD_NS + 1, False)])
-    @pytest.mark.parametrize("torn_before", [False, True])
+    @pytest.mark.parametrize(
+        ("pause_ns", "held", "torn_before"),
+        [*((health.HOLD_NS, True, torn) for torn in (0, 1)), *((health.HOLD_NS + 1, False, torn) for torn in (0, 1))],
+    )
     def test_a_reading_from_before_a_pause_is_not_held(self, pause_ns, held, torn_before):
         """Five scans are 50 ms at 100 Hz, but whole ones may have vanished: before was another press."""
-        watch, series = Health((4, 4)), ScanSeries("4", USPA44)
-        for number, (time_ns, taxel) in enumerate(
-            [(0, None), (PERIOD_NS, 0 if torn_before else None), (2 * PERIOD_NS, None), (2 * PERIOD_NS + pause_ns, 7)]
-        ):
-            counts = REST + number
-            if taxel is not None:
-                counts.reshape(3, 16)[:, taxel] = ABSENT
-            followed(watch, series.close(counts, time_ns), BASELINE)
-        assert watch.reasons == ({} if held else {7: "silent"})
-
-
-def raised(counts, baseline):
-    """Reasons over the scans of one recording."""
-    watch, series, found = Health((4, 4)), ScanSeries("4", USPA44), []
-    for number, row in enumerate(counts):
-        followed(watch, series.close(row.astype(np.int32), number * PERIOD_NS), baseline)
-        found.append(dict(watch.reasons))
-    return [reasons for reasons in found if reasons]
+        pad = Pad()
+        assert not any(pad.read(1) + pad.read(1, *[silent(0)] * torn_before) + pad.read(1))
+        torn = REST + 1
+        silent(7)(torn.reshape(3, 16))
+        assert pad.push(torn, pause_ns) == ({} if held else {7: "silent"})
 
 
 @pytest.mark.parametrize("path", [demo_recording(), *sorted(REAL_RECORDINGS.glob("*/xela_*.csv"))], ids=str)
@@ -208,7 +174,8 @@ def test_neither_the_demo_nor_real_grips_raise_anything(path):
     counts = load_recording(path).tracks[0].counts
     # Zeroed in the grip, as a robot may, and where the grip has been let go.
     for rest in (counts[:100], counts[-20:])[: 1 + (path.suffix == ".csv")]:
-        assert raised(counts, Baseline.from_counts("4", rest, 0.0)) == []
+        pad = Pad(Baseline.from_counts("4", rest, 0.0))
+        assert not any(pad.push(row) for row in counts)
 
 
 def saturated(pad, counts, press=PRESS, **changes):
@@ -243,16 +210,17 @@ class TestRuntime:
         result = runtime.push(replace(torn, device_ns=torn.time_ns if stamped else None))
         assert result.pattern is None and result.dead == {0: "silent", 1: "silent"}
 
-    @pytest.mark.parametrize(
-        ("taxels", "remedy"), [(tuple(range(8, 16)), "try another --id-map"), ((5,), "it may be broken")]
-    )
-    def test_a_taxel_that_stays_silent_is_named(self, taxels, remedy):
-        pad = Pushed(make_runtime(baselines={}))
-        notes = [pad.push(absent=taxels).note for _ in range(TAXEL_SILENT_SCANS)]
-        named = f"no pattern, taxel {', '.join(map(str, taxels))} silent"
-        assert notes[HOLD_SCANS - 1] is None and notes[HOLD_SCANS] == named
-        assert notes[-1] == f"{named}: {remedy}"
-        assert [pad.push().note for _ in range(BACK_SCANS)][-1] is None
+    def test_taxels_that_stay_silent_are_named_with_one_at_its_end(self):
+        one, half, ended = Pushed(make_runtime(baselines={})), Pushed(make_runtime(baselines={})), Pushed()
+        notes = [one.push(absent=(5,)).note for _ in range(TAXEL_SILENT_SCANS)]
+        assert notes[HOLD_SCANS - 1 : HOLD_SCANS + 1] == [None, "no pattern, taxel 5 silent"]
+        assert notes[-1] == "no pattern, taxel 5 silent: it may be broken"
+        assert [one.push().note for _ in range(BACK_SCANS)][-1] is None
+        taxels, why = tuple(range(8, 16)), "taxel 8, 9, 10, 11, 12, 13, 14, 15 silent: try another --id-map"
+        for _ in range(TAXEL_SILENT_SCANS):
+            note = half.push(absent=taxels).note
+            both = saturated(ended, health.RANGE_ENDS[1], press=0, absent=taxels).note
+        assert note == f"no pattern, {why}" and "taxel 5 at the end of its range" in both and both.endswith(why)
 
     @pytest.mark.parametrize("counts", health.RANGE_ENDS)
     def test_a_chip_at_the_end_of_its_range_has_no_reading(self, counts):
@@ -270,55 +238,29 @@ class TestRuntime:
         assert back.state == "contact" and len(back.notes) == 1 and back.dead == {}
         assert [saturated(pad, 65534).state for _ in range(HOLD_SCANS + 2)][-1] == "contact", "a count from the end"
 
-    def test_silent_ones_are_named_with_one_at_its_end(self):
-        pad, half = Pushed(), tuple(range(8, 16))
-        note = [saturated(pad, health.RANGE_ENDS[1], press=0, absent=half).note for _ in range(TAXEL_SILENT_SCANS)][-1]
-        assert "taxel 5 at the end of its range" in note
-        assert note.endswith("taxel 8, 9, 10, 11, 12, 13, 14, 15 silent: try another --id-map")
 
-
-GRID = (4, 4)
-
-
-@cache
-def estimator():
-    return load_estimator(TAXELS, GRID)
-
-
-def dead(*taxels):
-    mask = np.zeros(GRID, dtype=bool)
-    mask.flat[list(taxels)] = True
-    return mask
-
-
-def one_way(shape) -> NDArray[np.float64]:
-    """Return a covariance in which any living taxel determines every dead one: rank 3, one pattern an axis."""
-    return np.kron(np.diag([1.0, 1.0, 4.0]), np.outer(shape, shape)).astype(np.float64)
-
-
-@pytest.mark.parametrize(("taxels", "kind"), [((1, 6, 11), 0), ((1, 6), 1)])
-def test_the_dead_are_estimated_by_the_kind_of_contact(taxels, kind):
-    """Without error, where the others tell all."""
-    shapes = np.random.default_rng(0).uniform(500, 1500, (2, 16)) * [[1], [-1]]
-    filler = TaxelEstimator(np.stack([one_way(shape) for shape in shapes]), GRID).filler(dead(*taxels))
+@pytest.mark.parametrize("kind", [0, 1])
+def test_the_dead_are_estimated_by_the_kind_of_contact(kind):
+    """Without error, where any living taxel determines every dead one: one pattern an axis."""
+    shapes, dead = np.random.default_rng(0).uniform(500, 1500, (2, 16)) * [[1], [-1]], np.zeros((4, 4), dtype=bool)
+    dead.flat[[1, 6, 11]] = True
+    fill = filler(ridged(np.stack([np.kron(np.diag([1.0, 1, 4]), np.outer(shape, shape)) for shape in shapes])), dead)
     counts = np.outer([0.3, -0.2, 2.0], shapes[kind]).astype(np.float32).reshape(3, 4, 4)
-    told = filler(np.where(dead(*taxels), 1e6, counts).astype(np.float32))
+    told = fill(np.where(dead, 1e6, counts).astype(np.float32))
     np.testing.assert_allclose(told, counts, rtol=0.02)
-    np.testing.assert_array_equal(told[:, ~dead(*taxels)], counts[:, ~dead(*taxels)])
+    np.testing.assert_array_equal(told[:, ~dead], counts[:, ~dead])
 
 
-def test_covariances_of_another_grid_are_refused():
-    with pytest.raises(EdgeError, match="freeze them again"):
-        TaxelEstimator(np.eye(47)[None], GRID)
-
-
-def test_a_file_that_is_missing_is_refused(tmp_path):
-    with pytest.raises(EdgeError, match=r"taxels\.npz cannot be read"):
-        load_estimator(tmp_path / "taxels.npz", GRID)
+def test_a_file_that_is_missing_or_of_another_grid_is_refused(tmp_path):
+    path = tmp_path / "taxels.npz"
+    for why in ("No such file", r"covariances are \(1, 47, 47\), expected \(n, 48, 48\)"):
+        with pytest.raises(EdgeError, match=rf"taxels\.npz cannot be read .*{why}.*train\.freeze"):
+            load_estimator(path, (4, 4))
+        np.savez(path, covariances=np.eye(47)[None])
 
 
 def test_deviations_are_wider_the_more_taxels_are_dead():
-    pad = Pushed(make_runtime(FakeModel(make_contract(interval_factor=1.6)), estimator=estimator()))
+    pad = Pushed(make_runtime(FakeModel(make_contract(interval_factor=1.6)), estimator=ESTIMATOR))
     pad.push(PRESS)
     less = [pad.push(PRESS, absent=(0, 15)) for _ in range(HOLD_SCANS + 1)][-1]
     np.testing.assert_allclose(less.deviation, WIDENING[2] * 0.01 * (1 + np.abs(less.pattern)), rtol=1e-5)
@@ -327,7 +269,7 @@ def test_deviations_are_wider_the_more_taxels_are_dead():
 
 def test_taps_are_forgotten_when_a_taxel_dies_or_is_back():
     """A window never holds readings of an undetected dead taxel, or filled in ones, without a note."""
-    pad, dies = Pushed(make_runtime(estimator=estimator())), 10 + HOLD_SCANS
+    pad, dies = Pushed(make_runtime(estimator=ESTIMATOR)), 10 + HOLD_SCANS
     for number, press in enumerate([PRESS, PRESS, 0] * 12):
         pad.push(press, absent=(0,) if 10 <= number <= dies else ())
     used, lives = [result.taps_used for result in pad.results], dies + BACK_SCANS

@@ -4,7 +4,7 @@ import json
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import prod
@@ -81,14 +81,7 @@ def make_wrench_result(number: int = 0, press_counts: float = 20_000, **settings
     return runtime.push(make_scan(number, press_counts=press_counts, time_ns=time.monotonic_ns()))
 
 
-def write_model(
-    path: Path,
-    contract: Contract | None = None,
-    *,
-    metadata: dict[str, str] | None = None,
-    doubt: float = TINY_DOUBT,
-    gain: float = 1.0,
-) -> Path:
+def write_model(path: Path, contract: Contract | None = None, *, metadata=None, doubt=TINY_DOUBT, gain=1.0) -> Path:
     """Write a real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
 
     The deviation, there if the contract has a factor for it, is `tiny_deviation`. A pad, likewise, makes all stronger
@@ -107,8 +100,7 @@ def write_model(
     ]
     if pad_width:
         nodes[:0] = [
-            helper.make_node("Mul", [PAD_NAME, "pad_weights"], ["weighed"]),
-            helper.make_node("ReduceSum", ["weighed", "axis"], ["stiffer"], keepdims=1),
+            helper.make_node("MatMul", [PAD_NAME, "pad_weights"], ["stiffer"]),
             helper.make_node("Add", ["stiffer", "one"], ["stiff"]),
             helper.make_node("Unsqueeze", ["stiff", "last"], ["stiffness"]),
         ]
@@ -132,7 +124,7 @@ def write_model(
         "axis": np.array([1]),
         "last": np.array([2, 3]),
         "one": np.array([[1]], dtype=np.float32),
-        "pad_weights": np.arange(1, (pad_width or 1) + 1, dtype=np.float32)[None],
+        "pad_weights": np.arange(1, (pad_width or 1) + 1, dtype=np.float32)[:, None],
         "doubt": np.array(doubt, dtype=np.float32),
         **({} if pad_width else {"stiffness": np.ones((1, 1, 1, 1), dtype=np.float32)}),
     }
@@ -154,7 +146,6 @@ def save_graph(path: Path, nodes: list, contract: Contract, constants: dict, met
 
 
 def tiny_stiffness(pad_row: np.ndarray) -> float:
-    """Return the factor by which the tiny model's outputs are stronger for a pad."""
     return 1 + float(pad_row @ np.arange(1, len(pad_row) + 1))
 
 
@@ -170,21 +161,10 @@ def tiny_pattern(window_units: np.ndarray) -> np.ndarray:
 
 
 def tiny_deviation(pattern: np.ndarray) -> np.ndarray:
-    """Return the tiny model's deviation for its pattern."""
     return TINY_DOUBT * (1 + np.abs(pattern))
 
 
-def make_scan(
-    number: int = 0,
-    *,
-    press_counts: float = 0.0,
-    taxel: int = 5,
-    sensor: str = "4",
-    absent: tuple[int, ...] = (),
-    stale: tuple[int, ...] = (),
-    time_ns: int | None = None,
-    noise: int = 0,
-) -> Scan:
+def make_scan(number=0, *, press_counts=0.0, taxel=5, sensor="4", absent=(), stale=(), time_ns=None, noise=0) -> Scan:
     """Return a scan with one taxel pressed; `absent` taxels gave no reading, `stale` ones are not renewed."""
     counts = REST.copy()
     counts[2].flat[taxel] += int(press_counts)
@@ -228,10 +208,8 @@ class FakeModel:
     """Tiny model without onnxruntime."""
 
     def __init__(self, contract: Contract | None = None) -> None:
-        self.name = "fake"
-        self.contract = contract or make_contract()
-        self.windows: list[np.ndarray] = []
-        self.pads: list[np.ndarray | None] = []
+        self.name, self.contract = "fake", contract or make_contract()
+        self.windows, self.pads = [], []
         self.deviation: np.ndarray | None = None
         self.traction: np.ndarray | None = None
 
@@ -246,12 +224,7 @@ class FakeModel:
             self.traction = tiny_traction(window, self.contract.traction_scale).astype(np.float32) * stiffness
         return pattern
 
-    def run_together(
-        self,
-        windows: Sequence[np.ndarray],
-        pads: Sequence[np.ndarray] | None = None,
-        poses: Sequence[np.ndarray] | None = None,
-    ) -> np.ndarray:
+    def run_together(self, windows, pads=None, poses=None) -> np.ndarray:
         made = []
         for index, window in enumerate(windows):
             pad, rows = (None if more is None else more[index] for more in (pads, poses))
@@ -276,25 +249,13 @@ class FakeLink(Link):
     """
 
     def __init__(
-        self,
-        batches,
-        *,
-        error: Exception | None = None,
-        kind: SourceKind = "device",
-        endless: bool = False,
-        prefix: str = "",
-        lasts: bool = False,
+        self, batches, *, error=None, kind: SourceKind = "device", endless=False, prefix="", lasts=False
     ) -> None:
-        self.name = "fake"
-        self.prefix, self.lasts = prefix, lasts
+        self.name, self.prefix, self.lasts = "fake", prefix, lasts
         self.kind: SourceKind = kind
-        self.ended = False
-        self.reads = 0
-        self.through = threading.Event()
-        self._batches = list(batches)
-        self._error = error
-        self._endless = endless
-        self._given = 0
+        self.ended, self.through = False, threading.Event()
+        self.reads = self._given = 0
+        self._batches, self._error, self._endless = list(batches), error, endless
 
     def __enter__(self):
         return self
@@ -310,8 +271,7 @@ class FakeLink(Link):
                 raise self._error
             if self._endless:
                 time.sleep(min(timeout_s, 0.01))
-                return []
-            self.ended = True
+            self.ended = not self._endless
             return []
         batch = self._batches.pop(0)
         if isinstance(batch, threading.Event):
@@ -346,12 +306,8 @@ class ListSink(Sink):
     """Sink that keeps the results it gets."""
 
     def __init__(self, on_write=lambda result: None) -> None:
-        self.results = []
-        self.counters = []
-        self.events = []
-        self.told_counters = []
-        self.waits = 0
-        self.closed = False
+        self.results, self.counters, self.events, self.told_counters = [], [], [], []
+        self.waits, self.closed = 0, False
         self._on_write = on_write
 
     def write(self, result, counters) -> None:

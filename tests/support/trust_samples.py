@@ -2,7 +2,6 @@
 
 import numpy as np
 from edge_samples import make_pad_contract
-from pose_samples import make_posed_contract
 
 from edge.inference.contract import POSE_WIDTH, Contract
 from edge.inference.trust_model import (
@@ -66,5 +65,4 @@ def make_trusted_contract(**changes) -> Contract:
 
 def make_checked_contract(trust: Trust) -> Contract:
     """Return the contract of a model that takes a pad and poses, with such checks."""
-    pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
-    return make_posed_contract(pad_inputs=pad_inputs, takes_gains=True, traction_scale=2, trust=trust.to_json())
+    return make_pad_contract(taps=7, takes_poses=True, reach_mm=10.0, trust=trust.to_json())
