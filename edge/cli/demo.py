@@ -71,19 +71,15 @@ class DemoScenes:
 
 @dataclass(frozen=True, slots=True)
 class TapScore:
-    """Error of one tap's pattern against its truth, (H, W) in the model's unit, at the tap's peak.
+    """Error of one tap's pattern against its truth, (H, W) in the model's unit, at the tap's peak."""
 
-    The tap is numbered from 0; its pose is x and y in [mm] and turn in [deg], as the robot stated them. Errors are in
-    [dB] and in [% of full scale]; `alone_percent` is that of a pattern of this tap alone.
-    """
-
-    tap: int
-    pose: tuple[float, float, float]
+    tap: int  # from 0
+    pose: tuple[float, float, float]  # x and y in [mm], and turn in [deg], as the robot stated them
     result: Result
     truth: NDArray[np.float32]
     psnr_db: float
-    rmse_percent: float
-    alone_percent: float
+    rmse_percent: float  # of full scale
+    alone_percent: float  # likewise, of a pattern of this tap alone
 
 
 class DemoScore:
@@ -147,8 +143,7 @@ class DemoScore:
 def score_table(scores: Sequence[TapScore]) -> str:
     """Return the scores as a table with a line for each tap, 50 columns wide, and what the taps together are worth.
 
-    RMSE in [% of full scale], of the pattern and of one from the same tap alone; "+-" is the model's own estimate, half
-    the 90 % interval of touched pixels in [um].
+    "+-" is the model's own estimate, half the 90 % interval of touched pixels in [um].
     """
     lines = ["tap    x    y turn use   PSNR  RMSE alone  +- time", "      mm   mm  deg taps    dB   %fs   %fs  um   us"]
     for score in scores:
@@ -205,13 +200,7 @@ class DemoMap(MapSink):
 
 
 class Demo(Sink):
-    """Sink that makes a run the demo; it prints to `stream`, and shows its map on the live page, if there is one.
-
-    Where it `loops`, it goes on after its end, and each part is printed once it is complete.
-
-    Attributes:
-        map: made where the user makes none; a sink of its own.
-    """
+    """Sink that makes a run the demo; it prints to `stream`, and shows its map on the live page, if there is one."""
 
     def __init__(
         self,
@@ -224,12 +213,16 @@ class Demo(Sink):
         loops: bool,
         maps: bool,
     ) -> None:
-        """Begin the demo; scenes are announced to the sinks that are `watching`."""
+        """Begin the demo; scenes are announced to the sinks that are `watching`.
+
+        Where it `loops`, it goes on after its end, and each part is printed once it is complete.
+        """
         self._recording = recording = DemoRecording(demo_recording())
         self._stream, self._view, self._loops = stream, view, loops
         self._score = DemoScore(recording, model)
         if view is not None:
             view.show_truth(self._score.truth)
+        # A sink of its own, where the user makes no map.
         self.map = DemoMap(recording, None if view is None else view.show_map) if maps else None
         self._unprinted = [self._score, *([] if self.map is None else [self.map])]
 

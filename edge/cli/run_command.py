@@ -1,7 +1,4 @@
-"""Run of `edge-sr`: a source through the runtime into sinks, and its summary.
-
-Modules that only some runs need are imported where they are used.
-"""
+"""Run of `edge-sr`: a source through the runtime into sinks, and its summary; what only some runs need loads late."""
 
 import argparse
 import contextlib
@@ -184,10 +181,9 @@ def run(
     mapping: "MapSink | None" = None,
     looked_at: threading.Event | None = None,
 ) -> None:
-    """Run `edge-sr` without a command, or a command that runs the same way, with a source that is not open yet.
+    """Run a source that is not open yet into the sinks asked for, and with `mapping` into a map, which is closed here.
 
-    `statistics` are filled on the way, so that they are available however the run ends. `mapping` takes the results
-    into a map, which the live page shows; it is closed here. `looked_at` is set once somebody looks at that page.
+    `statistics` are filled on the way. `looked_at` is set once somebody looks at the live page.
     """
     statistics = Statistics() if statistics is None else statistics
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)

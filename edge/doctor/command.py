@@ -60,11 +60,7 @@ def _stdin_is_terminal() -> bool:
 
 
 class Visit:
-    """Visit to the sensors of one link: what is asked of a person, and what that gives.
-
-    `mountings` are corrections of the mountings, and `weighed` the counts per newton of those that were weighed, by
-    sensor; `unfinished` is true when a measurement was asked of a person, and not made.
-    """
+    """Visit to the sensors of one link: what is asked of a person, and what that gives."""
 
     def __init__(
         self,
@@ -76,9 +72,9 @@ class Visit:
         rehearsal: Rehearsal | None,
     ) -> None:
         """Prepare the visit; requests to a person, or to a `rehearsal`, go to `err`."""
-        self.mountings: dict[str, Mounting] = {}
-        self.weighed: dict[str, Weighed] = {}
-        self.unfinished = False
+        self.mountings: dict[str, Mounting] = {}  # corrections, by sensor
+        self.weighed: dict[str, Weighed] = {}  # counts per newton, by sensor
+        self.unfinished = False  # a measurement was asked of a person, and not made
         self._options, self._reader, self._sensor_file = options, reader, sensor_file
         self._link = reader.link
         self._err, self._stop, self._rehearsal = err, stop, rehearsal
@@ -186,11 +182,7 @@ class Visit:
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
-    """Run `edge-sr doctor`; returns the exit code. Findings go to `out`, requests to a person to `err`, if a terminal.
-
-    A link that was lost, and a sensor file that could not be written in the end, are raised after the findings were
-    printed.
-    """
+    """Run `edge-sr doctor`; return the exit code. A link that was lost is raised after the findings were printed."""
     if options.forget_gains is not None:
         if options.sensor is None:
             raise UsageError("--forget-gains is of a sensor file, which was not named: add --sensor FILE")
@@ -272,11 +264,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
 
 
 def check_writable(path: Path, sensor_file: SensorFile) -> None:
-    """Check that a file may be written, before minutes are spent on its content.
-
-    It is a new one, or that of `sensor_file`, of which all is kept that is not measured again. Raises SensorFileError
-    for another, and for one that cannot be written.
-    """
+    """Raise a SensorFileError for a file that cannot be written, and for one that is not `sensor_file`'s."""
     try:
         in_place.check_writable(path)
     except OSError as error:
@@ -310,10 +298,9 @@ def keep(
     *,
     emulated: bool = False,
 ) -> SensorFile:
-    """Write the `sensor_file` from before with the new results, by sensor, and return it as written.
+    """Write the `sensor_file` from before with the new results, by sensor, and return it, or raise a SensorFileError.
 
-    `port` is that of the adapter, whose serial number is kept where it has one; baselines are of the free pads as they
-    were read, and `mountings` are corrections of those before. Raises SensorFileError where it cannot be written.
+    `port` is that of the adapter. Baselines are as they were read; `mountings` correct those before.
     """
     with changing(path):
         entries, as_wired = dict(sensor_file.sensors), Mounting(taxel_count=sensor_file.geometry.taxel_count)

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -37,16 +37,12 @@ _PRESSED: Final = (
 
 @dataclass(frozen=True)
 class Examined:
-    """Findings of link and sensors, and by sensor the baselines of the pads that may be zeroed.
-
-    The pads of `loaded` sensors are not free, as an earlier baseline shows. `z_noise_counts` are the standard
-    deviations of each sensor's summed z.
-    """
+    """Findings of link and sensors, and what the guided press needs of each sensor."""
 
     findings: list[Finding]
-    baselines: dict[str, Baseline]
-    loaded: frozenset[str] = frozenset()
-    z_noise_counts: Mapping[str, float] = field(default_factory=dict)
+    baselines: dict[str, Baseline]  # of the pads that may be zeroed
+    loaded: frozenset[str]  # sensors whose pads are not free, as an earlier baseline shows
+    z_noise_counts: Mapping[str, float]  # standard deviation of summed z
 
 
 def judge(watched: Watched, unix_time_s: float) -> Examined:
@@ -96,10 +92,9 @@ def judge(watched: Watched, unix_time_s: float) -> Examined:
 def check_baseline(
     scans: Sequence[Scan], living: NDArray[np.bool_], spoiled: str | None, unix_time_s: float
 ) -> tuple[Baseline | None, Finding]:
-    """Return the baseline of the last scans if the pad can be zeroed, and the finding on it.
+    """Return the baseline of the last scans if all taxels are `living` and the pad can be zeroed, and the finding.
 
-    There is one only if all taxels are `living`; `spoiled` names another finding that explains a refusal. The last scan
-    was at `unix_time_s`, in [s] since 1970.
+    `spoiled` names another finding that explains a refusal; `unix_time_s` is the time of the last scan since 1970.
     """
     needed = zeroing.FEWEST_SCANS
     norm = f"{needed} scans that span at most {' / '.join(f'{limit:.0f}' for limit in zeroing.SPREAD_LIMIT_COUNTS)}"
@@ -128,10 +123,9 @@ def check_baseline(
 def check_load(
     rest_counts: NDArray[np.float64], reference: Baseline | None, mounting: Mounting | None = None
 ) -> Finding:
-    """Check whether something lies on the pad; only an earlier baseline of the free pad can show it.
+    """Check whether something lies on the pad, by an earlier baseline; the rest is (3, taxels), NaN where silent.
 
-    The rest now is (3, taxels), NaN where silent. The mounting gives the direction of z, which tells a load now from
-    one then; without one it is as wired.
+    The mounting gives the direction of z, which tells a load now from one then.
     """
     norm = f"z within {LOAD_LIMIT_COUNTS:.0f} counts of the baseline before"
     if reference is None:
@@ -152,8 +146,7 @@ def prepare(
 ) -> tuple[LinkReader, SensorFile, Watched]:
     """Return a reader of the link to the source that `texts` names, the facts on its sensors, and an empty watch of it.
 
-    `before` holds earlier baselines of the free pads, by sensor; `rate_hz` is expected of each sensor, in [Hz]. Raises
-    what source_setup.links_to raises, and UsageError for several sources.
+    `before` holds earlier baselines of the free pads, by sensor. Raises what source_setup.links_to raises.
     """
     if len(texts) > 1:
         raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
@@ -195,12 +188,8 @@ def examine(
 ) -> list[Finding]:
     """Watch free, still pads and report faults of sensor and adapter, as `edge-sr doctor` does without a person.
 
-    The source is one of `open_source`, which no other program may read meanwhile; `rate_hz` is expected of each sensor,
-    and `baselines` of the free pads, or their file, are by default those of the sensor file. `stop` ends it early.
-
-    Raises:
-        BridgeError: as for `open_source`; LinkLostError if the link is lost meanwhile.
-        UsageError: as for `open_source`; several sources, or baselines or a duration that are out of range.
+    The source is one of `open_source`, with its errors; no other program may read it meanwhile. `rate_hz` is expected
+    of each sensor, and `baselines` of the free pads, or their file, are by default those of the sensor file.
     """
     check_positive("duration_s", duration_s)
     sensor_file = sensor_settings(sensor, id_map)

@@ -33,10 +33,7 @@ class Press:
 
 
 def orders(geometry: SensorGeometry = USPA44) -> dict[str, tuple[int, ...]]:
-    """Return the orientations in which a pad can lie, by name; each gives the taxel of every place.
-
-    There are eight, and four where the pad is not square: a quarter turn would make another grid of it.
-    """
+    """Return the eight orientations in which a pad can lie, four if not square, by name: the taxel of every place."""
     grid = np.arange(geometry.taxel_count).reshape(geometry.rows, geometry.cols)
     orientations: dict[str, tuple[int, ...]] = {}
     for mirrored in (False, True):
@@ -103,10 +100,7 @@ _NORM: Final = "as the model expects: x right, y down, z up when pressed"
 def judge_press(
     presses: Sequence[Press], geometry: SensorGeometry = USPA44, *, kept: bool = False
 ) -> tuple[list[Finding], Mounting | None]:
-    """Return the findings, and the mounting that they give; None while order or axes are not clear.
-
-    Where the results are `kept`, in a sensor file, nothing is left to be done.
-    """
+    """Return the findings, and the mounting that they give, None while unclear. What a file has `kept` is right."""
     if len(presses) < FEWEST_CORNERS:
         measured = f"{len(presses)} of 4 corners measured"
         return [Finding(name, "not known", measured, "", _AGAIN) for name in ("taxel order", "axis signs")], None
@@ -151,7 +145,7 @@ class Weighed(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The interval itself."""
+        """Its 90 % interval."""
         return self.counts_per_newton * (1 - self.error), self.counts_per_newton * (1 + self.error)
 
     @property
@@ -220,35 +214,21 @@ Dialogue = Generator[str | None, Reading, T]
 
 
 class GuidedPress:
-    """Dialogue that asks a person for four presses on corners, one after the other, then to lay a weight on the pad.
-
-    Attributes:
-        first: the first request.
-        done: True when there are no more requests.
-        presses: those that were felt.
-        weight_g: mass of the weight in [g]; None where there is none.
-        weighed: counts per newton of the summed z, where a weight was laid on; else None.
-    """
+    """Dialogue that asks a person for four presses on corners, one after the other, then to lay a weight on the pad."""
 
     def __init__(self, geometry: SensorGeometry = USPA44, *, weigh: bool = False, z_noise_counts: float = 0.0) -> None:
-        """Prepare to ask, with `weigh` for a weight, too.
-
-        `z_noise_counts` is the standard deviation of the free pad's summed z, which it has under a still weight, too.
-        """
-        self.done = False
-        self.presses: list[Press] = []
-        self.weight_g: float | None = None
-        self.weighed: Weighed | None = None
+        """Prepare to ask, with `weigh` for a weight, too; summed z has the free pad's noise under a weight as well."""
+        self.done = False  # there are no more requests
+        self.presses: list[Press] = []  # those that were felt
+        self.weight_g: float | None = None  # mass of the weight; None where there is none
+        self.weighed: Weighed | None = None  # by the weight, if one was laid on
         self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
         self._dialogue = self._all(geometry.corners, weigh, z_noise_counts)
         self.first: Final = next(self._dialogue) or ""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
-        """Take one more reading (3, rows, cols) over the baseline, in counts; returns the next request, or None.
-
-        Where it is NaN the taxel's last reading stands.
-        """
-        self._held = np.where(np.isnan(zeroed), self._held, zeroed)
+        """Take one more reading (3, rows, cols) over the baseline, in counts; returns the next request, or None."""
+        self._held = np.where(np.isnan(zeroed), self._held, zeroed)  # of a torn scan the taxel's last reading stands
         return self._go_on(lambda: self._dialogue.send(Reading(self._held, time_s)))
 
     def type(self, line: str = "") -> str | None:

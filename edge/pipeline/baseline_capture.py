@@ -20,16 +20,10 @@ def take_baselines(
     stop: threading.Event | None = None,
     clock_s: Callable[[], float] = time.monotonic,
 ) -> dict[str, Baseline]:
-    """Take the baselines of all sensors of a source, by name, from free, still pads; give up at the first refusal.
+    """Take the baselines of all sensors of a source, by name: medians of their first 100 complete scans, pads free.
 
-    The scans of the source go nowhere else meanwhile. The median is of the first 100 complete scans of each sensor;
-    `stop` ends it early.
-
-    Raises:
-        BaselineRefusedError: a pad moved or was loaded, or the source ended too soon.
-        DeviceError: no scan arrived for a long time, or no whole new one of a sensor.
-        LinkLostError: the link is lost.
-        UsageError: a stream reads the source.
+    Raises a BaselineRefusedError where a pad moved or was loaded, or the source ended or was stopped too soon, and a
+    DeviceError where no scan, or no whole new one of a sensor, arrived for a long time. No stream may read the source.
     """
     source.reserve()
     clock = (lambda: math.nan) if source.kind == "replay" else time.time  # never today's, of an old file

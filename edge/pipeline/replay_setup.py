@@ -27,23 +27,14 @@ def open_recording(
     rate_hz: float | None = None,
     begins: threading.Event | None = None,
 ) -> Source:
-    """Open a recording as a source, to compute its results again as `edge-sr replay` does.
+    """Open a recording, .mcap, .npz or .csv, as a source, to compute its results again as `edge-sr replay` does.
 
-    Every scan gets a result, however slow the loop is, with the time, mounting and baseline of the recording.
-
-    Args:
-        path: .mcap, .npz or .csv.
-        more: recordings of other sensors, played beside it.
-        sensor: file that `edge-sr doctor` wrote, used instead of the recorded settings.
-        zero: zero from the first 100 scans, instead of using the recorded baselines.
-        paced: play at the recorded speed, as if live; a loop that is too slow loses scans, as with a sensor.
-        rate_hz: scans a second of each sensor, where the file does not state it, or to play it at another speed.
-        begins: set when a paced recording is to begin; at once without.
-
-    Raises:
-        RecordingError: the recording cannot be used.
-        SourceError: its rate is unknown or out of range.
-        SensorFileError: the sensor file cannot be used.
+    Every scan gets a result, however slow the loop is, with the time, mounting and baseline of the recording. Those of
+    other sensors may be played beside it. A `sensor` file of the doctor takes the place of the recorded settings.
+    `zero` takes the baselines from the first 100 scans instead. With `paced` it is played at the recorded speed, from
+    when `begins` is set, as if live: a loop that is too slow loses scans. `rate_hz` is the scans a second of each
+    sensor, where the file does not state it, or to play it at another speed. Raises RecordingError, SourceError for
+    the rate, or SensorFileError.
     """
     paths = [path for file in (path, *more) for path in recording_paths(str(file))]
     replay = ReplayLink(paths, rate_hz, paced=paced, begins=begins)
@@ -75,13 +66,7 @@ def recorded_baselines(
 ) -> tuple[dict[str, Baseline], list[str]]:
     """Return the baselines of FILE[,FILE], from where each pad is free and still, and notes where that is.
 
-    `rate_hz` is that of each sensor, where a file does not state it.
-
-    Raises:
-        BaselineRefusedError: a pad is nowhere free and still.
-        RecordingError: a recording cannot be used.
-        SensorFileError: the sensor file is of an emulated sensor, and the recording is not.
-        SourceError: its rate is unknown or out of range.
+    Raises BaselineRefusedError where a pad is nowhere free and still, and what `open_recording` raises.
     """
     replay = ReplayLink(recording_paths(text), rate_hz)
     refuse_emulated(sensor_file, replay.kind, replay.origin)

@@ -32,14 +32,7 @@ if TYPE_CHECKING:
 
 
 def load_model(model: str | Path, threads: int = 1) -> "ModelSession":
-    """Load a model, a file or a bundled one by its name, and its contract; mtsr2 to mtsr7 take as many taps at most.
-
-    `threads` share the work of one run.
-
-    Raises:
-        ModelError: the model does not exist or cannot be used; the message names the bundled ones or the fault.
-        UsageError: the number of threads is out of range.
-    """
+    """Load a model, a file or a bundled one by its name, or raise a ModelError; `threads` share the work of one run."""
     check_whole("threads", threads, 1)
     from edge.inference.onnx_session import ModelSession
 
@@ -55,26 +48,12 @@ def open_runtime(
     pad: Pad | Mapping[str, Pad] | None = None,
     **options: Any,
 ) -> Runtime:
-    """Return a runtime that makes results of a source's scans; its defaults are those of `edge-sr`.
+    """Return a runtime that makes results of an open source's scans, by a model of `load_model`, its name or file.
 
-    Args:
-        model: name of a bundled one, a file, or a model that `load_model` returned.
-        source: open source of the scans.
-        baselines: stored ones, or their file; they take precedence over those of the source's sensor file. A sensor
-            without one is zeroed from its first 100 scans, during which its pad must be still and free.
-        counts_per_newton: summed z per [N], of all sensors or by name; by default as in the sensor file. A name from
-            which no scan arrives is reported as an event.
-        pad: properties of the pad of all sensors, or of each by name, for models that use them; by default as in the
-            sensor file.
-        options: those of `RuntimeOptions`, such as `every_scan=True`. With `learn` a `Stream` keeps the gains that it
-            learns in the source's sensor file; with `taps` and without poses taps follow the paper's schedule, each
-            turned by 5 degrees from the one before.
-
-    Raises:
-        ModelError: the model does not exist, cannot be used, or is for another sensor.
-        RecordingError: the baseline file cannot be used, or its taxel order is not that of the sensor file.
-        UsageError: the source is not open; a baseline is of another grid; a number is out of range; `taps` is more than
-            the model takes.
+    Baselines, or their file, summed z counts per newton, and the pads are of all sensors or of each by name, and
+    override those of the source's sensor file. A sensor without a baseline is zeroed from its first 100 scans, during
+    which its pad must be still and free. Options are those of `RuntimeOptions`, with the defaults of `edge-sr`. Raises
+    ModelError, RecordingError for the baseline file, or UsageError.
     """
     chosen = RuntimeOptions(**options)
     if not isinstance(model, (str, Path)):
@@ -104,18 +83,10 @@ def infer(
 ) -> list[Result]:
     """Return a result for each scan of an array, as `edge-sr` makes it of the same scans of a sensor.
 
-    Args:
-        model: as in `open_runtime`; load it once with `load_model` if there are many arrays.
-        counts: (n, 3, rows, cols) raw counts in the order of their times, or one scan (3, rows, cols); or (n, 48) or
-            (n, 16, 3) as the vendor orders those of a uSPa44: x, y, z of taxel 1, of taxel 2, ... Whole numbers of any
-            type; -1 where a taxel gave no reading.
-        baseline: counts of the free pad in one of these shapes, whose median is taken, or their mean; or a Baseline.
-        rate_hz: scans a second, in [Hz].
-
-    Raises:
-        UsageError: counts are not whole; an array is of another shape, or out of range; the rate is.
-        ModelError: as in `open_runtime`.
-        RecordingError: counts are readings over a baseline, cut off at 0, or absent on some axes of a taxel.
+    Counts are raw and whole, (n, 3, rows, cols) or (3, rows, cols), or (n, 48) or (n, 16, 3) as the vendor orders those
+    of a uSPa44: x, y, z of taxel 1, of taxel 2, ...; -1 where a taxel gave no reading. The baseline is a Baseline, or
+    counts of the free pad in one of these shapes, of which the median is taken. Raises UsageError for other arrays,
+    RecordingError for counts over a baseline, and ModelError.
     """
     from firmware_bridge.links.replay import ReplayLink
 

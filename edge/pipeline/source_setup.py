@@ -26,12 +26,7 @@ def unmapped(pad: SensorGeometry) -> str | ModelMap:
 
 
 def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) -> SensorFile:
-    """Return the settings of the sensors, by a sensor file and an id map as requested.
-
-    Raises:
-        SensorFileError: the sensor file cannot be used.
-        UsageError: the id map does not exist, or the file is of another, with another order and baseline.
-    """
+    """Return the settings of the sensors, by a sensor file and an id map as requested; raises where they differ."""
     if isinstance(id_map, ModelMap):
         if sensor is not None:
             raise UsageError(f"id map {id_map.name} of the program's own, and {sensor}: leave one of them out")
@@ -50,11 +45,7 @@ def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) ->
 def links_to(texts: Sequence[str], sensor_file: SensorFile, rate_hz: float | None) -> tuple[list[Link], SensorFile]:
     """Return the links to the requested sources, else to the sensor file's adapter or the only one; not yet entered.
 
-    With them come the settings of their sensors, as `with_recorded` makes them.
-
-    Raises:
-        SourceError: as in open_sources; NoDeviceError and RecordingError as well.
-        UsageError: a source is not a text; the rate is out of range; the demo's recording is not installed.
+    With them come the settings of their sensors, as `with_recorded` makes them. Errors are those of open_sources.
     """
     if rate_hz is not None:
         check_positive("rate_hz", rate_hz)
@@ -76,11 +67,7 @@ def with_recorded(sensor_file: SensorFile, links: Iterable[Link]) -> SensorFile:
 
 
 def refuse_emulated(sensor_file: SensorFile, kind: SourceKind, origin: SourceKind | None) -> None:
-    """Refuse to use settings of an emulated sensor on a device, or on a recording of anything else.
-
-    Raises:
-        SensorFileError: the sensor file is of an emulated sensor, in part or whole.
-    """
+    """Raise a SensorFileError for settings of an emulated sensor on a device, or on a recording of anything else."""
     if "emulated" in (kind, origin):
         return
     this = "recording is not known to be of one" if kind == "replay" else "is a device"

@@ -30,10 +30,9 @@ def wrapped(text: str, width: int, start: str = "", indent: str = "") -> list[st
 
 
 class HelpFormatter(argparse.HelpFormatter):
-    """Formatter that lays out descriptions and epilogues by the form of each line.
+    """Formatter that keeps lines which begin with a space, and makes of others a paragraph, or an entry at a tab.
 
-    A line with a tab is an entry of a list: a term, and its meaning in the column of the options' meanings. A line that
-    begins with a space is kept. Any other line is a paragraph.
+    An entry of a list is a term, and its meaning in the column of the options' meanings.
     """
 
     def __init__(self, prog: str) -> None:

@@ -1,8 +1,7 @@
 """End of a program on Ctrl-C and similar signals: after the scans in hand, and if necessary by force.
 
-Python runs a handler of signals between two steps of its main thread, and so never while a call into a library does
-not return: a model that loops, a pipe that is full, a peer that is gone. The system's own part of a handler runs all
-the same, and wakes a thread here.
+Python runs no handler while a call into a library does not return: a model that loops, a pipe that is full. The
+system's own part of a handler runs all the same, and wakes a thread here.
 """
 
 import contextlib
@@ -23,8 +22,7 @@ STDIN, STDERR = 0, 2
 def handled(names: Iterable[str], handle: Callable[[int, Any], object]) -> Iterator[Collection[int]]:
     """Handle signals within a with statement, and yield their numbers.
 
-    Signals that the parent has this program ignore stay ignored: nohup does so with a hang-up, and a shell without jobs
-    with the Ctrl-C that is meant for another program in front.
+    Those that the parent has this program ignore stay so, as a hang-up under nohup, or a Ctrl-C for another program.
     """
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     before = {number: signal.getsignal(number) for number in numbers if signal.getsignal(number) != signal.SIG_IGN}
