@@ -17,8 +17,6 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S, SENSOR_SILENT_NS
 
 FEWEST_INTERVALS: Final = 5  # fewest intervals that give a period
-LONGEST_BURST: Final = 500
-"""Scans of a burst: five seconds of a sensor at 100 Hz; a longer one is the sensor's own pace."""
 GAP_PERIODS: Final = 1.5  # between two scans; jitter, and adapters that hold scans for 16 ms, stay below at 10 ms
 SETTLING_SCANS: Final = 5  # at their pace after a gap, before the missing ones are counted by the least late of them
 FEWEST_TOGETHER: Final = 4  # fewest sensors that are read together a few times a period
@@ -37,7 +35,6 @@ class Cadence:
         # Median of the newest intervals, which neither jitter nor a gap moves; None while too few have arrived.
         self.period_ns = self._stated_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
         self._intervals: deque[int] = deque(maxlen=31)
-        self._hurried = 0
         self._forget_pace(None)
 
     @property
@@ -53,17 +50,9 @@ class Cadence:
             return
         gap_ns = scan.on_bus_ns - before.on_bus_ns
         if gap_ns > 0 and (scan.device_ns is not None or not scan.unread_ns):  # those that waited came at no pace
-            # Held up somewhere, it came right behind the one before; unless all of late did. Bursts of all sixteen
-            # frames, 16 ms apart, are further apart.
-            hurried = self.period_ns is not None and gap_ns * 8 < self.period_ns
-            self._hurried = self._hurried + 1 if hurried else 0
-            if self._hurried > LONGEST_BURST:
-                self._intervals.clear()
-                self.period_ns = self._stated_ns
-            if not 0 < self._hurried <= LONGEST_BURST:
-                self._intervals.append(gap_ns)
-                if self._stated_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
-                    self.period_ns = sorted(self._intervals)[len(self._intervals) // 2]
+            self._intervals.append(gap_ns)
+            if self._stated_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
+                self.period_ns = sorted(self._intervals)[len(self._intervals) // 2]
         period_ns = self.period_ns
         # Half of the fastest sensor's: scans that are nearer waited somewhere.
         if period_ns and period_ns >= 500_000 and (self._before_gap is not None or gap_ns > GAP_PERIODS * period_ns):
