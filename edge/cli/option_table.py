@@ -159,7 +159,7 @@ lines on stdin, where it is no terminal:
 The signal SIGUSR1 is like key z.
 
 {EXAMPLES}
-Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
+Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 137 ended by force.
 """,
     ),
     "demo": Subcommand(

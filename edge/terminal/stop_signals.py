@@ -11,11 +11,10 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 END_S: Final = 5.0  # time from the signal to the end by force
-EXIT_FORCED: Final = 6
-STDIN, STDERR = 0, 2
+STDERR = 2
 
 
 @contextlib.contextmanager
@@ -48,9 +47,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
     woken.setblocking(False)
     with handled(("SIGINT", "SIGTERM", "SIGHUP"), handle) as numbers:
         before = signal.set_wakeup_fd(woken.fileno(), warn_on_full_buffer=False)
-        # The terminal as it is now: the caller may change it before the thread runs.
-        watched = (waking, numbers, _terminal_settings())
-        thread = threading.Thread(target=_watch, args=watched, name="ending", daemon=True)
+        thread = threading.Thread(target=_watch, args=(waking, numbers), name="ending", daemon=True)
         thread.start()
         try:
             yield stop
@@ -61,36 +58,18 @@ def stop_on_signals() -> Iterator[threading.Event]:
             waking.close()
 
 
-def _watch(waking: socket.socket, numbers: Collection[int], terminal: list[Any] | None) -> None:
-    """End the process by force if it goes on for END_S after one of these signals, and after any that come later."""
-    stopping = False
+def _watch(waking: socket.socket, numbers: Collection[int]) -> None:
+    """Kill the process if it goes on for END_S after the last of these signals."""
     while True:
         try:
             received = waking.recv(64)
         except TimeoutError:
-            _force(terminal)
+            with contextlib.suppress(OSError):
+                if select.select([], [STDERR], [], 0)[1]:  # an unread pipe may be what blocks the program
+                    os.write(STDERR, f"edge-sr: not ended {END_S:g} s after the signal: ended by force\n".encode())
+            os.kill(os.getpid(), signal.SIGKILL)  # a shell restores the terminal after a signal, not after an exit
+            return
         if not received:
             return
-        if not stopping and set(numbers) & set(received):
-            stopping = True
+        if set(numbers) & set(received):
             waking.settimeout(END_S)
-
-
-def _terminal_settings() -> list[Any] | None:
-    with contextlib.suppress(ImportError, OSError):
-        import termios
-
-        return termios.tcgetattr(STDIN) if os.isatty(STDIN) else None
-    return None
-
-
-def _force(terminal: list[Any] | None) -> NoReturn:
-    if terminal is not None:  # a shell does not restore it after a program that exits
-        import termios
-
-        with contextlib.suppress(termios.error):
-            termios.tcsetattr(STDIN, termios.TCSANOW, terminal)
-    with contextlib.suppress(OSError):
-        if select.select([], [STDERR], [], 0)[1]:  # an unread pipe may be what blocks the program
-            os.write(STDERR, f"edge-sr: not ended {END_S:g} s after the signal: ended by force\n".encode())
-    os._exit(EXIT_FORCED)
