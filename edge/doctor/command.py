@@ -55,8 +55,7 @@ def typed_line() -> str | None:
 
 
 def _stdin_is_terminal() -> bool:
-    # Only on POSIX can a terminal be polled for input.
-    return os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
+    return sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
 class Visit:

@@ -5,7 +5,7 @@ the middle of the pad, its surface moves along both axes, and each corner has an
 readings fits only one axis and one direction, and any three corners settle which.
 """
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Collection, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple, TypeVar
 
@@ -87,12 +87,6 @@ def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> tu
     return None
 
 
-def z_sign(presses: Sequence[Press]) -> int | None:
-    """Return 1 if z rises under every press, -1 if it falls under every one; None where they contradict each other."""
-    signs = {int(np.sign(press.z_counts)) for press in presses}
-    return signs.pop() if len(signs) == 1 else None
-
-
 _AGAIN: Final = "press again: run the doctor once more"
 _NORM: Final = "as the model expects: x right, y down, z up when pressed"
 
@@ -107,7 +101,8 @@ def judge_press(
     verdict, remedy = "wrong", "write a sensor file, edge-sr doctor --out FILE, and run edge-sr --sensor FILE"
     if kept:
         verdict, remedy = "look", "the sensor file states this: run edge-sr with it"
-    turn, axes, z = find_order(presses, geometry), find_axes(presses, geometry), z_sign(presses)
+    turn, axes = find_order(presses, geometry), find_axes(presses, geometry)
+    z_signs = {int(np.sign(press.z_counts)) for press in presses}
     norm = "each corner answers where it is pressed"
     if turn is None:
         corners = ", ".join(f"{CORNERS[geometry.corners.index(press.place)]}: taxel {press.taxel}" for press in presses)
@@ -115,10 +110,10 @@ def judge_press(
         order = Finding("taxel order", "wrong", corners, norm, other)
     else:
         order = judged("taxel order", "ok" if turn == AS_MAPPED else verdict, turn, norm, remedy)
-    if axes is None or z is None:
-        return [order, _unclear_axes(sum(press.push_counts is not None for press in presses), z)], None
+    if axes is None or len(z_signs) > 1:
+        return [order, _unclear_axes(sum(press.push_counts is not None for press in presses), z_signs)], None
     swapped, signs_xy = axes
-    mounting = Mounting(swap_xy=swapped, signs=(*signs_xy, z), taxel_count=geometry.taxel_count)
+    mounting = Mounting(swap_xy=swapped, signs=(*signs_xy, z_signs.pop()), taxel_count=geometry.taxel_count)
     ways = [way for way, sign in zip("xyz", mounting.signs, strict=True) if sign < 0]
     parts = ["x and y swapped"] * mounting.swap_xy + [f"{', '.join(ways)} reversed"] * bool(ways)
     measured = " and ".join(parts) or "x right, y down, z up when pressed"
@@ -126,8 +121,8 @@ def judge_press(
     return [order, signs], None if turn is None else replace(mounting, order=orders(geometry)[turn])
 
 
-def _unclear_axes(pushes: int, z: int | None) -> Finding:
-    if z is None:
+def _unclear_axes(pushes: int, z_signs: Collection[int]) -> Finding:
+    if len(z_signs) > 1:
         remedy = "z must do the same under every press: the pad was still loaded, or a taxel is reversed; press again"
         return Finding("axis signs", "wrong", "z rises under some presses and falls under others", _NORM, remedy)
     if pushes < FEWEST_CORNERS:
@@ -166,9 +161,8 @@ HEAVIEST_G: Final = 4000  # 40 N, the deepest presses of the training
 LEAST_SHARE: Final = 0.25  # of the mean, on the taxel that reads least under a weight that covers the pad
 COVERED_ERROR: Final = 0.08
 PARTLY_ERROR: Final = 0.3
-"""By simulated discs of 2 N that lie as their weight lets them, on 8 pads of the whole range, in the middle and 1.5 mm
-off: those of 22 and 28 mm read 0.93 to 1.04 of the right counts, those of 19 mm that pass as covering up to 1.09, and
-those of 14 and 16 mm, which do not, 0.68 to 1.15."""
+"""By simulated discs of 2 N on 8 pads, in the middle and 1.5 mm off: those of 22 and 28 mm read 0.93 to 1.04 of the
+right counts, those of 19 mm that pass as covering up to 1.09, and of 14 and 16 mm, which do not, 0.68 to 1.15."""
 
 
 def judge_force(weighed: Weighed | None, *, kept: bool) -> Finding:
@@ -353,19 +347,14 @@ def _wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[
         reading = yield None
 
 
-def _load_counts(zeroed: NDArray[np.float32]) -> float:
-    """Return the sum of the sizes of z, in either direction."""
-    return float(np.abs(zeroed[2]).sum())
-
-
 def _shear_counts(reading: Reading) -> NDArray[np.float32]:
     """Return the sums of x and of y."""
     return reading.zeroed[:2].sum(axis=(1, 2))
 
 
 def _touched(reading: Reading) -> bool:
-    return _load_counts(reading.zeroed) >= ON_COUNTS
+    return bool(np.abs(reading.zeroed[2]).sum() >= ON_COUNTS)
 
 
 def _free(reading: Reading) -> bool:
-    return _load_counts(reading.zeroed) < OFF_COUNTS
+    return bool(np.abs(reading.zeroed[2]).sum() < OFF_COUNTS)
