@@ -40,27 +40,17 @@ class HelpFormatter(argparse.HelpFormatter):
         self._width = max(min(self._width, 80), FEWEST_COLUMNS)
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        return "\n".join(
-            indent + line
-            for paragraph in text.splitlines()
-            for line in self._laid_out(paragraph, self._width - len(indent))
-        )
+        return "\n".join(line for paragraph in text.splitlines() for line in self._laid_out(paragraph))
 
-    def _laid_out(self, line: str, width: int) -> list[str]:
+    def _laid_out(self, line: str) -> list[str]:
         term, tab, meaning = line.partition("\t")
         if not tab:
-            return [line] if line.startswith(" ") else textwrap.wrap(line, width) or [""]
-        column = min(self._max_help_position, width // 2)
-        beside = len(term) + 4 <= column
-        first = f"  {term}"
-        lines = textwrap.wrap(
-            meaning,
-            width,
-            initial_indent=first.ljust(column) if beside else " " * column,
-            subsequent_indent=" " * column,
-            break_on_hyphens=False,
-        )
-        return lines if beside else [first, *lines]
+            return [line] if line.startswith(" ") else wrapped(line, self._width) or [""]
+        column = min(self._max_help_position, self._width // 2)
+        first, indent = f"  {term}", " " * column
+        if len(first) + 2 <= column:
+            return wrapped(meaning, self._width, first.ljust(column), indent)
+        return [first, *wrapped(meaning, self._width, indent, indent)]
 
 
 EXIT_USAGE: Final = 2
