@@ -155,16 +155,16 @@ class Cadences:
             if last is None or cadence.silent or now_ns - max(last.time_ns, cadence.since_ns) <= SENSOR_SILENT_NS:
                 continue
             cadence.silent = True
-            events.append(self._silence(sensor, last.time_ns, "the recording has none in that time"))
+            events.append(self._silence(sensor, last.time_ns))
         if self._expected and now_ns - self._first_ns > SENSOR_SILENT_NS:
             missing, self._expected = sorted(self._expected), set()
             self._absent.update(missing)
-            why = "the recording has none of it, though there is a baseline or a force for it"
-            events += [self._silence(sensor, self._first_ns, why) for sensor in missing]
+            events += [self._silence(sensor, self._first_ns) for sensor in missing]
         return events
 
-    def _silence(self, sensor: str, since_ns: int, why_recorded: str) -> Event:
-        why = why_recorded if self._recorded else "check its cable and its controller, since other sensors continue"
+    def _silence(self, sensor: str, since_ns: int) -> Event:
+        why = "check its cable and its controller, since other sensors continue"
+        why = "the recording has none" if self._recorded else why
         silent_s = (self._newest_ns - since_ns) / NS_PER_S
         return Event(self._newest_ns, "silent", sensor, f"no scan from sensor {sensor} for {silent_s:.1f} s: {why}")
 

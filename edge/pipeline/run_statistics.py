@@ -180,7 +180,8 @@ _ADVICE: Final = {
 def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int]]) -> str:
     """Return what came of the sources, as the user named them, what may be wrong, and what to do."""
     source = f" --source {as_typed(sources[0])}" if len(sources) == 1 else ""
-    arrived = {name: count for name, count in counters().items() if count}
+    counted = counters()
+    arrived = {name: counted[name] for name in ("received_bytes", "messages", *_ADVICE) if counted.get(name)}
     came = ", ".join(f"{name} {count}" for name, count in arrived.items())
     if arrived.get("skipped_bytes", 0) <= MOST_STRAY_BYTES:
         arrived.pop("skipped_bytes", None)

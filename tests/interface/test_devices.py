@@ -167,7 +167,7 @@ def counted(said):
         ({"messages": 5, "welcomes": 1, "without_readings": 4}, "without_readings 4 came: .* name no sensor"),
         (
             {"received_bytes": 240, "status_answers": 60},
-            "status_answers 60 came: is the sensor powered .*edge-sr doctor",
+            "only received_bytes 240 came: is the sensor powered .*edge-sr doctor",
         ),
         ({"frames": 0, "error_frames": 7}, "only error_frames 7 came: .* 1 Mbit/s"),
     ],
