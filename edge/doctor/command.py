@@ -98,7 +98,7 @@ class Visit:
 
     def _press_one(self, name: str, whose: str, examined: Examined) -> None:
         geometry, answers = self._sensor_file.geometry, self._rehearsal is not None or _stdin_is_terminal()
-        guide = GuidedPress(geometry, weigh=answers, z_noise_counts=examined.z_noise_counts[name])
+        guide = GuidedPress(geometry, weigh=answers)
         skips = " Enter skips a request." * (self._rehearsal is None and _stdin_is_terminal())
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.{skips}")
         self._lead(guide, name, examined, whose)

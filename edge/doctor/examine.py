@@ -42,7 +42,6 @@ class Examined:
     findings: list[Finding]
     baselines: dict[str, Baseline]  # of the pads that may be zeroed
     loaded: frozenset[str]  # sensors whose pads are not free, as an earlier baseline shows
-    z_noise_counts: Mapping[str, float]  # standard deviation of summed z
 
 
 def judge(watched: Watched, unix_time_s: float) -> Examined:
@@ -85,8 +84,7 @@ def judge(watched: Watched, unix_time_s: float) -> Examined:
             baselines[name] = baseline
         findings += [replace(finding, sensor=name) for finding in of_sensor]
     loaded = frozenset(finding.sensor for finding in findings if finding.remedy == _PRESSED and finding.sensor)
-    noise_counts = {name: samples.z_sum_noise_counts() for name, samples in enough.items()}
-    return Examined(findings, baselines, loaded, noise_counts)
+    return Examined(findings, baselines, loaded)
 
 
 def check_baseline(

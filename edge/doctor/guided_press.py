@@ -210,14 +210,14 @@ Dialogue = Generator[str | None, Reading, T]
 class GuidedPress:
     """Dialogue that asks a person for four presses on corners, one after the other, then to lay a weight on the pad."""
 
-    def __init__(self, geometry: SensorGeometry = USPA44, *, weigh: bool = False, z_noise_counts: float = 0.0) -> None:
-        """Prepare to ask, with `weigh` for a weight, too; summed z has the free pad's noise under a weight as well."""
+    def __init__(self, geometry: SensorGeometry = USPA44, *, weigh: bool = False) -> None:
+        """Prepare to ask, with `weigh` for a weight, too."""
         self.done = False  # there are no more requests
         self.presses: list[Press] = []  # those that were felt
         self.weight_g: float | None = None  # mass of the weight; None where there is none
         self.weighed: Weighed | None = None  # by the weight, if one was laid on
         self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
-        self._dialogue = self._all(geometry.corners, weigh, z_noise_counts)
+        self._dialogue = self._all(geometry.corners, weigh)
         self.first: Final = next(self._dialogue) or ""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
@@ -238,7 +238,7 @@ class GuidedPress:
             self.done = True
             return None
 
-    def _all(self, corners: Sequence[int], weigh: bool, z_noise_counts: float) -> Dialogue[None]:
+    def _all(self, corners: Sequence[int], weigh: bool) -> Dialogue[None]:
         for place, name in zip(corners, CORNERS, strict=True):
             try:
                 press = yield from _corner(place, name)
@@ -253,7 +253,7 @@ class GuidedPress:
         if weigh:
             self.weight_g = yield from _mass_g()
         if self.weight_g is not None:
-            self.weighed = yield from _weigh(self.weight_g, z_noise_counts)
+            self.weighed = yield from _weigh(self.weight_g)
 
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
@@ -306,21 +306,18 @@ def _number(text: str) -> float:
         return np.nan
 
 
-def _weigh(weight_g: float, z_noise_counts: float) -> Dialogue[Weighed | None]:
+def _weigh(weight_g: float) -> Dialogue[Weighed | None]:
     """Return what a weight shows; None where nothing steady was laid on."""
     steady: list[NDArray[np.float32]] = []  # of z
 
     def lies_still(reading: Reading) -> bool:
         steady.append(reading.zeroed[2])
         del steady[:-STEADY_SCANS]
-        sums = np.abs(np.sum(steady, axis=(1, 2)))
-        if len(sums) < STEADY_SCANS or sums.min() <= 100.0:
+        if len(steady) < STEADY_SCANS:
             return False
-        # Noise alone spreads 50 readings over 4.5 of its deviations, and the means of ten of them over 0.7; hardly ever
-        # over these limits.
-        allowed, means = max(30.0, 0.02 * sums.max()), sums.reshape(5, -1).mean(axis=1)
-        spread_by_noise = np.ptp(sums) < max(allowed, 7 * z_noise_counts)
-        return bool(spread_by_noise and np.ptp(means) < max(allowed, 1.5 * z_noise_counts))
+        # Means of ten scans: usual noise of 4 counts a taxel spreads them over 12.
+        sums = np.abs(np.sum(steady, axis=(1, 2))).reshape(-1, 10).mean(axis=1)
+        return bool(sums.min() > 100.0 and np.ptp(sums) < max(20.0, 0.02 * sums.max()))
 
     ask = f"Lay {weight_g:g} g on the pad, flat and covering all of it, hands off."
     laid = yield from _wait(ask, lies_still, 1)

@@ -164,7 +164,7 @@ def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path, limits):
 
 
 def test_two_sensors_are_pressed_in_turn_and_compared_in_a_grip():
-    people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person(grip_counts=5000, z_noise_counts=6)]
+    people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person(grip_counts=5000)]
     with Emulator([recording(*people, rate_hz=120.0)]) as emulator:
         asked = ("--json", "--rate-hz", 120)
         done = doctor(emulator.port, *asked, people=people, typed=["200", "200"], drift_s=1.2)

@@ -62,14 +62,11 @@ class Person:
 
     shape = (1, 3, 4, 4)
 
-    def __init__(
-        self, mounting: Mounting | None = None, grip_counts: float = 4000.0, z_noise_counts: float = 2.0
-    ) -> None:
+    def __init__(self, mounting: Mounting | None = None, grip_counts: float = 4000.0) -> None:
         self._mounting = mounting or Mounting()
         self._felt = self._free = np.zeros((3, 4, 4))
         self._place = self._gripped = 0
         self._grip_counts = grip_counts
-        self._noise_counts = np.array([2, 2, z_noise_counts])[:, None, None]
         self._rng = np.random.default_rng(7)
 
     def hear(self, text: str) -> str | None:
@@ -104,9 +101,7 @@ class Person:
                 self._gripped -= 1
                 self._felt = np.zeros((3, 4, 4))
                 self._felt[2] = (self._grip_counts if self._gripped else 0.0) / 16
-            yield np.rint(REST + self.deformation() + self._rng.normal(0, self._noise_counts, (3, 4, 4))).astype(
-                np.int32
-            )
+            yield np.rint(REST + self.deformation() + self._rng.normal(0, 2, (3, 4, 4))).astype(np.int32)
 
 
 def visit(mounting: Mounting | None = None, *, rest: int = 20) -> np.ndarray:
