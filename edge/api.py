@@ -30,7 +30,7 @@ from edge.pipeline.commands import Command, Commands
 from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.result_stream import Latest, Stream, paired, pump
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.runtime_setup import infer, load_model, open_runtime
+from edge.pipeline.runtime_setup import infer, load_model, open_recording, open_runtime
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.pipeline.source_setup import links_to, sensor_settings
@@ -60,7 +60,6 @@ if TYPE_CHECKING:
     from edge.mapping.sink import MapSink, ObjectMap
     from edge.perception.patches import Patch, PatchEvent, PatchEvents, patches
     from edge.pipeline.baseline_capture import take_baselines
-    from edge.pipeline.replay_setup import open_recording
     from edge.pose_sources import PoseSource, open_poses
     from firmware_bridge.links.discovery import devices
 
@@ -70,7 +69,6 @@ _ON_USE: Final = {
     "edge.mapping.sink": ["MapSink", "ObjectMap"],
     "edge.perception.patches": ["Patch", "PatchEvent", "PatchEvents", "patches"],
     "edge.pipeline.baseline_capture": ["take_baselines"],
-    "edge.pipeline.replay_setup": ["open_recording"],
     "edge.pose_sources": ["PoseSource", "open_poses"],
     "firmware_bridge.links.discovery": ["devices"],
 }

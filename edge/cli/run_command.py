@@ -31,6 +31,7 @@ from edge.api import (
     find_model,
     load_baselines,
     load_model,
+    open_recording,
     open_runtime,
     open_sink,
     open_source,
@@ -77,7 +78,6 @@ def show_demo(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Run `edge-sr replay`."""
     from edge.api import example_recording
-    from edge.pipeline.replay_setup import open_recording
 
     files = [*options.file, *[example_recording()] * options.example]
     if not files:
@@ -106,7 +106,8 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
             if FILE_FORMAT.encode() not in file.read(1 << 16):
                 raise UsageError(f"{options.out} holds something else: give another name, or delete it first")
     if len(options.source) == 1 and options.source[0].startswith("replay:"):
-        from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
+        from edge.pipeline.baseline_capture import recorded_baselines
+        from edge.pipeline.source_setup import sensor_settings
 
         kind, sensor_file = "replay", sensor_settings(options.sensor, options.id_map)
         played = options.source[0].removeprefix("replay:")

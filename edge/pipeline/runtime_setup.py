@@ -1,5 +1,7 @@
-"""Models and runtimes by name, with the settings of a source; and results of scans that a program has in an array."""
+"""Models, recordings and runtimes with the settings of a source; and results of scans that are in an array."""
 
+import math
+import threading
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +20,12 @@ from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import load_estimator
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped
-from edge.validation import check_kind, check_positive, check_whole
+from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped, with_recorded
+from edge.validation import check_kind, check_positive
+from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44, pad_of
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track, check_raw
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.sensor_file.model import SensorEntry
@@ -31,12 +35,11 @@ if TYPE_CHECKING:
     from edge.inference.onnx_session import ModelSession
 
 
-def load_model(model: str | Path, threads: int = 1) -> "ModelSession":
-    """Load a model, a file or a bundled one by its name, or raise a ModelError; `threads` share the work of one run."""
-    check_whole("threads", threads, 1)
+def load_model(model: str | Path) -> "ModelSession":
+    """Load a model, a file or a bundled one by its name, or raise a ModelError."""
     from edge.inference.onnx_session import ModelSession
 
-    return ModelSession(find_model(model), threads, taps=taps_of(model))
+    return ModelSession(find_model(model), taps=taps_of(model))
 
 
 def open_runtime(
@@ -76,6 +79,52 @@ def open_runtime(
         options=chosen,
         unix_time_s=source.unix_time_s,
     )
+
+
+def open_recording(
+    path: str | Path,
+    *more: str | Path,
+    sensor: str | Path | None = None,
+    zero: bool = False,
+    paced: bool = False,
+    rate_hz: float | None = None,
+    begins: threading.Event | None = None,
+) -> Source:
+    """Open a recording, .mcap, .npz or .csv, as a source, to compute its results again as `edge-sr replay` does.
+
+    Every scan gets a result, however slow the loop is, with the time, mounting and baseline of the recording. Those of
+    other sensors may be played beside it. A `sensor` file of the doctor takes the place of the recorded settings.
+    `zero` takes the baselines from the first 100 scans instead. With `paced` it is played at the recorded speed, from
+    when `begins` is set, as if live: a loop that is too slow loses scans. `rate_hz` is the scans a second of each
+    sensor, where the file does not state it, or to play it at another speed. Raises RecordingError, SourceError for
+    the rate, or SensorFileError.
+    """
+    from edge.pipeline.baseline_capture import free_baselines
+    from firmware_bridge.links.replay import ReplayLink
+
+    paths = [path for file in (path, *more) for path in recording_paths(str(file))]
+    replay = ReplayLink(paths, rate_hz, paced=paced, begins=begins)
+    tracks = [track for recording in replay.recordings for track in recording.tracks]
+    # A sensor file names the pad; without one the recording's grid does.
+    file = sensor_settings(sensor, unmapped(tracks[0].geometry) if sensor is None else None)
+    stored = with_recorded(file, [replay])
+    baselines: dict[str, Baseline] = {}
+    for recording in () if zero else replay.recordings:
+        # By the clock of an undated recording, they would be half a century old in a run of today.
+        undated = {"created_unix_s": math.nan} if paced and not recording.unix_offset_ns else {}
+        baselines |= {name: replace(baseline, **undated) for name, baseline in recording.baselines.items()}
+    if not zero:
+        baselines = baselines or stored.baselines
+        baselines |= free_baselines(replay, stored.mountings, baselines, rate_hz=rate_hz)
+    sensors = {*stored.sensors, *baselines}
+    if sensor is None:  # else a note reports the sensors that the file lacks
+        sensors |= {track.sensor for track in tracks}
+    as_wired = SensorEntry(Mounting(taxel_count=file.geometry.taxel_count))
+    entries = {
+        name: replace(stored.sensors.get(name, as_wired), baseline=baselines.get(name)) for name in sorted(sensors)
+    }
+    place_recordings(replay, file.mountings)
+    return Source(replay, sensor_file=replace(stored, sensors=entries), rate_hz=rate_hz)
 
 
 def infer(

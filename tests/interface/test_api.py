@@ -96,7 +96,6 @@ def stream(source, model=None, **settings):
         (lambda _: api.examine("demo", rate_hz=-1), "rate_hz is -1, expected a positive number"),
         (lambda _: api.examine("demo", baselines={"4": 1}), "baseline of sensor 4 is a int, expected"),
         (lambda _: api.examine("demo", "demo"), "^2 sources, expected one: examine them one after"),
-        (lambda _: load_model("stsr", threads=-1), "threads is -1, expected a whole number from 1"),
         (lambda _: open_runtime(FakeModel(), "demo"), "source is 'demo', expected an open one"),
         (lambda source: open_runtime(FakeModel(), source, counts_per_newton=0), "counts_per_newton is 0, expected a"),
         (lambda source: open_runtime(FakeModel(), source, counts_per_newton={"6": NAN}), "newton of sensor 6 is nan"),
