@@ -27,7 +27,7 @@ from firmware_bridge.errors import harmless
 
 STDIN, STDOUT, STDERR = 0, 1, 2
 _FIXED: Final[dict[str, dict[str, Any]]] = {
-    "demo": {"sensor": None, "id_map": None, "baseline": None, "poses": [], "give_up_s": None},
+    "demo": {"source": ["demo"], "sensor": None, "id_map": None, "baseline": None, "poses": [], "give_up_s": None},
     "replay": {"source": [], "id_map": None, "give_up_s": None, "poses": []},
 }
 """Options of a run that a command of its kind does not have, with the values that they have there."""

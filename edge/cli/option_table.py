@@ -162,7 +162,7 @@ Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 137 ended by force.
 """,
     ),
     "demo": Subcommand(
-        "edge.cli.run_command:show_demo",
+        "edge.cli.run_command:follow",
         "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
         "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
         (Group("sensor", Option("--rate-hz R", positive, "scans a second (default 100)")), *RESULTS),

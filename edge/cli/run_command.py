@@ -69,12 +69,6 @@ def follow(
     run(options, _source(options, inf if options.give_up_s is None else options.give_up_s), statistics, mapping)
 
 
-def show_demo(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
-    """Run `edge-sr demo`."""
-    options.source = ["demo"]
-    follow(options, out, err)
-
-
 def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Run `edge-sr replay`."""
     from edge.api import example_recording

@@ -21,7 +21,6 @@ from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.grip import ASK as GRIP
 from edge.doctor.grip import Grip
 from edge.doctor.guided_press import (
-    PARTLY_ERROR,
     PATIENCE_S,
     GuidedPress,
     Weighed,
@@ -130,10 +129,9 @@ class Visit:
                     grip.push(scan.sensor, scan.time_ns / NS_PER_S, float(np.nansum(zeroed[2])))
             if typed_line() is not None:
                 return
-        scales = {name: Weighed(value, PARTLY_ERROR) for name, value in self._sensor_file.counts_per_newton.items()}
-        for name, (low, high) in self._sensor_file.scale_intervals.items():
-            value = scales[name].counts_per_newton
-            scales[name] = Weighed(value, max(high - value, value - low) / value)
+        weighed, scales = self._sensor_file.counts_per_newton, dict[str, Weighed]()
+        for name, (low, high) in self._sensor_file.scale_intervals.items():  # without one it is no measured scale
+            scales[name] = Weighed(weighed[name], (high - low) / 2 / weighed[name])
         examined.findings.extend(grip.judge(scales | self.weighed))
         self.weighed.update(grip.weighed)
 

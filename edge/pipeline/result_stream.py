@@ -45,10 +45,6 @@ class Stream(Loop):
 
     _worker: ThreadPoolExecutor | None = None
 
-    def __repr__(self) -> str:
-        statistics = self.statistics
-        return f"<Stream of {self._source.name}: {statistics.scans} scans, {statistics.patterns} patterns>"
-
     def pose(
         self,
         x_mm: float,
