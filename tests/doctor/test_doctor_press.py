@@ -152,7 +152,6 @@ class TestPerson:
             (1700.0, 1.0, 0.08, "look", True),
             (1500.0, 1.0, 0.08, "look", False),
             (1500.0, 0.2, 0.3, "look", True),
-            (3800.0, 1.0, 0.08, "look", False),
             (200.0, 1.0, 0.08, "look", False),  # 2000 g typed as 200
         ],
     )
