@@ -220,7 +220,9 @@ def run(
                 asked = replace(asked, every_scan=True)  # it shows the run time of every scan
             settings = {"baselines": baselines, "counts_per_newton": options.counts_per_newton}
             runtime = open_runtime(model, source, **settings, **asdict(asked))
-            give_back_memory()
+            # Free memory goes back to the system, by glibc alone: a network takes more while it is loaded.
+            if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+                trim(ctypes.c_size_t(0))
             sinks: list[Sink] = []
             if played is not None:
                 sinks += [played, *([] if played.map is None else [played.map])]
@@ -258,12 +260,6 @@ def run(
             raise DeviceError(f"no scan came from {source.name}: {hint()}")
         if played is not None:
             played.finish()
-
-
-def give_back_memory() -> None:
-    """Give free memory back to the system, by glibc alone: a network takes more while it is loaded than afterwards."""
-    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
-        trim(ctypes.c_size_t(0))
 
 
 def _open_view(

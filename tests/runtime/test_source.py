@@ -171,13 +171,7 @@ def test_a_contact_that_waited_gets_all_its_patterns(patience_s):
     stamped = [replace(scan, device_ns=scan.time_ns) for scan in scans]
     link = FakeLink([[scan] for scan in stamped[:150]] + [rested, stamped[150:]])
 
-    class Patient(ListSink):
-        def write(self, result, counters):
-            super().write(result, counters)
-            if result.scan.number == 149:
-                rested.set()
-
-    sink = Patient()
+    sink = ListSink(on_write=lambda result: result.scan.number == 149 and rested.set())
     sink.patience_s = patience_s
     late_ns = scans[-1].time_ns + 100_000_000
     statistics = pumped(link, sink, clock_ns=lambda: late_ns)
