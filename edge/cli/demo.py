@@ -113,10 +113,7 @@ class DemoScore:
         return self._model.run(window)
 
     def text(self) -> str:
-        """Return a table with a line for each tap, 50 columns wide, and what the taps together are worth.
-
-        "+-" is the model's own estimate, half the 90 % interval of touched pixels in [um].
-        """
+        """Return a table with a line for each tap, 50 columns wide, and what the taps together are worth."""
         scores, of = self.scores(), f"of {self._recording.figure_taps} taps scored"
         if not scores:
             return f"none {of}: the run ended before a tap had a pattern"
@@ -125,7 +122,7 @@ class DemoScore:
         lines.append("      mm   mm  deg taps    dB   %fs   %fs  um   us")
         for score in scores:
             interval_mm = score.result.interval_mm
-            interval = "-" if interval_mm is None else f"{1000 * interval_mm:.0f}"
+            interval = "-" if interval_mm is None else f"{1000 * interval_mm:.0f}"  # half of 90 %, of touched pixels
             x_mm, y_mm, turn_deg = score.pose
             figures = f"{score.psnr_db:6.2f} {score.rmse_percent:5.2f} {score.alone_percent:5.2f}"
             place = f"{score.tap + 1:3d} {x_mm:4.1f} {y_mm:4.1f} {turn_deg:4.0f} {score.result.taps_used:3d}"
@@ -186,10 +183,7 @@ class Demo(Sink):
         loops: bool,
         maps: bool,
     ) -> None:
-        """Begin the demo; scenes are announced to the sinks that are `watching`.
-
-        Where it `loops`, it goes on after its end, and each part is printed once it is complete.
-        """
+        """Begin the demo, announced to sinks that are `watching`; one that `loops` prints a part once that is over."""
         self._recording = recording = DemoRecording(demo_recording())
         self._stream, self._view, self._watching, self._commands, self._loops = stream, view, watching, commands, loops
         self._scene = FREE

@@ -144,10 +144,7 @@ def _open_closed_streams() -> None:
 
 @contextlib.contextmanager
 def _guarded_streams() -> Iterator[None]:
-    """Replace stdout by one whose faults are those of a sink, and stderr by one without, in a with statement.
-
-    A reader of stdout that has had enough ends the block without a message; any other fault raises SinkError.
-    """
+    """Let faults of stdout raise a SinkError, unless its reader has had enough, and those of stderr end nothing."""
     streams = sys.stdout, sys.stderr
     sys.stdout = cast("TextIO", _Guarded(streams[0], _refuse_stdout))
     sys.stderr = cast("TextIO", _Guarded(streams[1], lambda error: _stand_in(streams[1], STDERR)))

@@ -176,10 +176,7 @@ def run(
     mapping: "MapSink | None" = None,
     looked_at: threading.Event | None = None,
 ) -> None:
-    """Run a source that is not open yet into the sinks asked for, and with `mapping` into a map, which is closed here.
-
-    `statistics` are filled on the way. `looked_at` is set once somebody looks at the live page.
-    """
+    """Run a source that is not open yet into the sinks asked for, and `mapping`, which is closed here, into a map."""
     statistics = Statistics() if statistics is None else statistics
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
     loops = options.source == [DEMO_LOOP]

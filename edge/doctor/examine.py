@@ -121,10 +121,7 @@ def check_baseline(
 def check_load(
     rest_counts: NDArray[np.float64], reference: Baseline | None, mounting: Mounting | None = None
 ) -> Finding:
-    """Check whether something lies on the pad, by an earlier baseline; the rest is (3, taxels), NaN where silent.
-
-    The mounting gives the direction of z, which tells a load now from one then.
-    """
+    """Check by an earlier baseline whether something lies on the pad; its rest is (3, taxels), NaN where silent."""
     norm = f"z within {LOAD_LIMIT_COUNTS:.0f} counts of the baseline before"
     if reference is None:
         remedy = "a pad that was loaded from the start looks free; pass an earlier --baseline or --sensor"
@@ -142,10 +139,7 @@ def check_load(
 def prepare(
     texts: Sequence[str], sensor_file: SensorFile, before: Mapping[str, Baseline], rate_hz: float | None
 ) -> tuple[LinkReader, SensorFile, Watched]:
-    """Return a reader of the link to the source that `texts` names, the facts on its sensors, and an empty watch of it.
-
-    `before` holds earlier baselines of the free pads, by sensor. Raises what source_setup.links_to raises.
-    """
+    """Return a reader of the link to the source that `texts` names, its sensors' settings, and an empty watch of it."""
     if len(texts) > 1:
         raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
     check_baselines(before, sensor_file.model_map.geometry)

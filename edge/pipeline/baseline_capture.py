@@ -78,10 +78,7 @@ def take_baselines(
 def recorded_baselines(
     text: str, sensor_file: SensorFile, rate_hz: float | None
 ) -> tuple[dict[str, Baseline], list[str]]:
-    """Return the baselines of FILE[,FILE], from where each pad is free and still, and notes where that is.
-
-    Raises BaselineRefusedError where a pad is nowhere free and still, and what `open_recording` raises.
-    """
+    """Return the baselines of FILE[,FILE], and notes where each pad is free, or raise a BaselineRefusedError."""
     replay = ReplayLink(recording_paths(text), rate_hz)
     refuse_emulated(sensor_file, replay.kind, replay.origin)
     baselines = free_baselines(replay, with_recorded(sensor_file, [replay]).mountings, opening=True, rate_hz=rate_hz)

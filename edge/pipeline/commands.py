@@ -1,7 +1,4 @@
-"""Commands to a run in one queue, and poses in another: from keys, signals, viewers and JSON lines on stdin.
-
-A line is such as {"cmd": "reset"}, or {"cmd": "pose", "x_mm": 1.5, "y_mm": 0}.
-"""
+"""Commands to a run in one queue, and poses in another: from keys, signals, viewers and JSON lines on stdin."""
 
 import os
 import select
@@ -100,10 +97,7 @@ class Commands:
 
 @contextmanager
 def command_lines(commands: Commands, descriptor: int) -> Iterator[None]:
-    """Take lines of a file descriptor, which stays open, as commands within a with statement.
-
-    A thread takes them, since a pose without a time has that of its arrival, and the loop may be waiting for a scan.
-    """
+    """Take lines of a file descriptor, which stays open, as commands within a with statement."""
     woken, waking = os.pipe()
 
     def follow() -> None:
@@ -118,6 +112,7 @@ def command_lines(commands: Commands, descriptor: int) -> Iterator[None]:
                 for line in lines:
                     _take_line(commands, line)
 
+    # A pose without a time has that of its arrival, and the loop may be waiting for a scan.
     thread = threading.Thread(target=follow, name="command-lines", daemon=True)
     thread.start()
     try:

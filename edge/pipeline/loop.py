@@ -122,10 +122,7 @@ class Loop:
                 self._on_event(made)
 
     def _step(self, wait_s: float) -> None:
-        """Make the results of all that waits, after waiting at most `wait_s` [s]; an error waits until they are taken.
-
-        A patient source gives one scan.
-        """
+        """Make the results of what waits after at most `wait_s` [s], then raise errors; a patient source gives one."""
         with self._turn:
             if self._error is not None:
                 raise self._error.with_traceback(None)  # else every call would lengthen it

@@ -39,10 +39,7 @@ class PoseError(ValueError):
 
 
 def pose_of_fields(fields: Mapping[str, Any], now_ns: int) -> TimedPose:
-    """Return the pose in parsed JSON, of its arrival if it states no time; raises PoseError where a field does not fit.
-
-    The JSON is such as {"cmd": "pose", "x_mm": 1.5, "y_mm": 0}.
-    """
+    """Return the pose in parsed JSON, of its arrival without a time, or raise a PoseError where a field is wrong."""
     errors = {"error_mm": PLACE_ERROR_MM, "error_deg": TURN_ERROR_DEG}
     numbers = {"x_mm": None, "y_mm": None, "turn_deg": 0.0} | errors
     defaults = {"cmd": "pose", **numbers, "sensor": None, "time_ns": now_ns, "holds": False}
@@ -169,8 +166,7 @@ class PoseIntake:
     ) -> list[TimedPose]:
         """Pass on the poses that wait and those of the source, and return those that the runtime has taken.
 
-        They hold from the first scan after them, or from now where none has come. `no_sensor` returns why no sensor has
-        a name.
+        They hold from the first scan after them, or from now where none has come.
         """
         waiting = self._queue.take()
         if self._refused is not None:

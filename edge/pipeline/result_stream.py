@@ -78,11 +78,7 @@ class Stream(Loop):
             raise UsageError(f"a pose: {error}") from error
 
     def __iter__(self) -> Iterator[Result]:
-        """Yield every result from the next one on; those of scans that waited together come once all are made.
-
-        Raises LinkLostError after every scan before it got its result, ModelError where a pattern is not finite, and
-        SinkError where a sink cannot be written.
-        """
+        """Yield every result from the next one on; then raise what ended it: LinkLostError, ModelError, SinkError."""
         while True:
             yield from self._returned()
             if self._ended and self._error is None:
@@ -115,10 +111,7 @@ class Stream(Loop):
         return {name: self._take_newest(name) for name in tuple(self._newest)}
 
     def read(self, sensor: str | None = None, *, timeout_s: float = 1.0) -> Latest:
-        """Return the newest result of a sensor as `latest` does, after waiting for one that no earlier call returned.
-
-        Raises NoResultError where none came in `timeout_s`, or no more will come.
-        """
+        """Return the newest result as `latest`, once there is a new one, or raise NoResultError after `timeout_s`."""
         for wait_s in self._waits_s(sensor, timeout_s):
             self._step_live(wait_s)
         return self._take_newest(sensor)

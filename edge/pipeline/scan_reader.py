@@ -38,10 +38,7 @@ class Source:
         rate_hz: float | None = None,
         give_up_s: float = 0.0,
     ) -> None:
-        """Prepare to read links that are not open yet; `give_up_s` is the longest time that one may be away, in [s].
-
-        Raises SourceError where some are emulated and some are not: results of both kinds must not be mixed.
-        """
+        """Prepare to read links that are not open yet, all emulated or none; one may be away for `give_up_s` [s]."""
         _one_kind(links)
         self.name = ", ".join(link.name for link in links)
         self.patient = len(links) == 1 and links[0].patient  # it waits for its reader, and its scans are not of now
@@ -79,11 +76,7 @@ class Source:
         self.close()
 
     def open(self) -> Self:
-        """Open the links and begin to read; `close` ends it, as does the end of a with statement or of the program.
-
-        Raises UsageError where it was opened before, SensorFileError where the sensor file is of an emulated sensor and
-        the scans are not, and other BridgeErrors where a link cannot be opened.
-        """
+        """Open the links and begin to read, or raise a BridgeError; `close` or the end of the program ends it."""
         if self._opened or self._closed:
             state = "opened" if self._opened else "closed"
             raise UsageError(f"source {self.name} was {state} before: make another, with open_source")
@@ -151,10 +144,7 @@ class Source:
         return time.time() if offset_ns is None else ((self.last_ns or 0) + offset_ns) / 1e9
 
     def take(self, timeout_s: float) -> list[Scan | Notice | TimedPose] | None:
-        """Return all that waits, in order, after waiting at most `timeout_s` for it; None when no more will come.
-
-        An error that ended the reading, such as LinkLostError, is raised after all scans before it were taken.
-        """
+        """Return all that waits, after at most `timeout_s`; after all scans None, or raise what ended the reading."""
         if not self._opened or self._closed:
             raise self._not_open()
         if self.patient:

@@ -43,10 +43,7 @@ def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) ->
 
 
 def links_to(texts: Sequence[str], sensor_file: SensorFile, rate_hz: float | None) -> tuple[list[Link], SensorFile]:
-    """Return the links to the requested sources, else to the sensor file's adapter or the only one; not yet entered.
-
-    With them come the settings of their sensors, as `with_recorded` makes them. Errors are those of open_sources.
-    """
+    """Return the links to the requested sources, else to the only adapter, not yet entered, and sensors' settings."""
     if rate_hz is not None:
         check_positive("rate_hz", rate_hz)
     for text in texts:
@@ -83,15 +80,12 @@ def refuse_emulated(sensor_file: SensorFile, kind: SourceKind, origin: SourceKin
 def stored_baselines(
     baselines: Mapping[str, Baseline] | str | Path | None, sensor_file: SensorFile
 ) -> Mapping[str, Baseline]:
-    """Return the baselines of free pads: stored ones, or their file, before those of the sensor file.
-
-    One that a program has kept for FRESH_S, or of an unknown date, is as old as one of a file: it is in doubt as well.
-    """
+    """Return the baselines of free pads: stored ones, or their file, before those of the sensor file."""
     if isinstance(baselines, (str, Path)):
         return load_baselines(baselines, sensor_file.orders)
     if not isinstance(baselines, Mapping):  # which is refused where the runtime is made
         return sensor_file.baselines if baselines is None else baselines
-    now_s = time.time()
+    now_s = time.time()  # one that a program has kept for long is as old as one of a file, and in doubt as well
     return {
         name: replace(one, origin="file") if isinstance(one, Baseline) and not one.age_s(now_s) < FRESH_S else one
         for name, one in baselines.items()

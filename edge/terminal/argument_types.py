@@ -20,10 +20,7 @@ def columns() -> int:
 
 
 def wrapped(text: str, width: int, start: str = "", indent: str = "") -> list[str]:
-    """Wrap a paragraph into lines of `width` columns, of which the first begins with `start`, the others with `indent`.
-
-    A wider word stays whole, since paths and options are copied from the text.
-    """
+    """Wrap a paragraph after `start`, further lines after `indent`; a wider word stays whole, as it may be copied."""
     return textwrap.wrap(
         text, width, initial_indent=start, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
     )

@@ -19,11 +19,9 @@ STDERR = 2
 
 @contextlib.contextmanager
 def handled(names: Iterable[str], handle: Callable[[int, Any], object]) -> Iterator[Collection[int]]:
-    """Handle signals within a with statement, and yield their numbers.
-
-    Those that the parent has this program ignore stay so, as a hang-up under nohup, or a Ctrl-C for another program.
-    """
+    """Handle signals within a with statement, and yield their numbers."""
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    # What the parent ignores stays so: a hang-up under nohup, Ctrl-C that is for another program.
     before = {number: signal.getsignal(number) for number in numbers if signal.getsignal(number) != signal.SIG_IGN}
     for number in before:
         signal.signal(number, handle)
