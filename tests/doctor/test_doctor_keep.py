@@ -139,7 +139,7 @@ def test_what_is_not_known_is_not_well():
 
 
 @pytest.mark.parametrize("name", ["no/such/s.toml", "", "/proc/s.toml", "good.toml"])
-def test_a_file_that_may_not_be_written_is_refused_before_the_visit(tmp_path, good, name):
+def test_a_file_that_may_not_be_written_is_refused_at_once(tmp_path, good, name):
     """One that holds something is not replaced by less: it has to be the visit's --sensor as well."""
     content, words = good.read_text(), r"cannot be written: .*: pass --out a file"
     words = r"left as it is, because .* would be lost: pass --sensor .*good\.toml" if name == "good.toml" else words
