@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cli_samples import start, write_recording
-from doctor_samples import REST, WEIGHT_COUNTS, Person, as_scans, healthy_counts
+from doctor_samples import REST, Person, as_scans, healthy_counts
 from edge_samples import FakeLink
 
 from edge.api import load_sensor_file
@@ -128,7 +128,7 @@ def test_the_next_run_goes_by_the_order_axes_and_force_measured(monkeypatch, tmp
     known = load_sensor_file(file)
     entry = known.sensors["4"]
     assert entry.mounting == sits and known.model == "uSPa44" and known.adapter is None
-    assert entry.counts_per_newton == pytest.approx(WEIGHT_COUNTS / 1.96133, rel=0.02)
+    assert entry.counts_per_newton == pytest.approx(1176, rel=0.02)
     ends = [entry.counts_per_newton * share for share in (0.92, 1.08)]
     assert entry.counts_per_newton_interval == pytest.approx(ends, rel=1e-4)
     in_place = REST.reshape(3, 16)[:, list(sits.order)].reshape(3, 4, 4)

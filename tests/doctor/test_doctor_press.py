@@ -4,7 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from doctor_samples import finger, visit
+from doctor_samples import visit
 
 from edge.doctor import guided_press
 from edge.doctor.grip import Grip
@@ -18,6 +18,7 @@ from edge.doctor.guided_press import (
     judge_press,
     orders,
 )
+from edge.doctor.rehearsal import load_asked
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 
@@ -57,7 +58,7 @@ def test_every_turn_and_every_axis_is_found(name):
 
 def test_a_skipped_corners_finger_does_not_count_for_the_next():
     guide = GuidedPress()
-    pressed = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(0)])
+    pressed = load_asked("Press the top left corner", np.zeros((3, 4, 4)))
     answer_to([pressed] * 10, guide)
     assert guide.type() == "Skipped. Let go."
     more, _ = answer_to([pressed] * 40, guide)
