@@ -15,18 +15,9 @@ from firmware_bridge.errors import how_to_install, need
 
 FORBIDDEN = {"torch", "onnx", "trimesh", "scipy", "shapely", "skimage", "pytest", "hypothesis"}
 UNUSED_IN_A_REPLAY = {
-    *(
-        "edge.sinks.json_records",
-        "edge.sinks.converted_files",
-        "edge.sinks.ros2.sink",
-        "cyclonedds",
-        "tqdm",
-        "edge.bench",
-    ),
-    *("edge.cli.demo", "cyclonedds", "tqdm", "websockets", "usb", "can", "subprocess"),
-    *("firmware_bridge.emulation.slcan_emulator", "firmware_bridge.links.demo"),
-    *("firmware_bridge.links.slcan_serial", "firmware_bridge.links.xela_server"),
-    *("firmware_bridge.links.gs_usb_link", "firmware_bridge.links.can_bus"),
+    *("edge.bench", "edge.cli.demo", "edge.sinks.json_records", "edge.sinks.converted_files", "edge.sinks.ros2.sink"),
+    *("cyclonedds", "tqdm", "websockets", "usb", "can", "subprocess", "firmware_bridge.emulation.slcan_emulator"),
+    *(f"firmware_bridge.links.{name}" for name in ("demo", "slcan_serial", "xela_server", "gs_usb_link", "can_bus")),
 }
 MOST_MODULES = 101
 """Modules of ours that a run loads: each is work for a reader, and for a start."""
