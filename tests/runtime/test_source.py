@@ -82,6 +82,17 @@ class TestOpening:
             assert source.kind == "emulated"
 
 
+class Telling(FakeLink):
+    """Link that has a notice at one of its reads."""
+
+    def __init__(self, parts, read, kind):
+        super().__init__(parts)
+        self._read, self._notice = read, Notice(0, kind, "told")
+
+    def notices(self):
+        return [self._notice] if self.reads == self._read else []
+
+
 class TestOne:
     def test_a_scan_wakes_who_waits_for_it(self):
         gate = threading.Event()
@@ -100,11 +111,7 @@ class TestOne:
         ],
     )
     def test_a_notice_keeps_its_place_among_lost_scans(self, at, given):
-        class Telling(FakeLink):
-            def notices(self):
-                return [Notice(0, "lost", "told")] if self.reads == at + 1 else []
-
-        link = Telling([[scan] for scan in presses(range(CAPACITY_SCANS + 5))])
+        link = Telling([[scan] for scan in presses(range(CAPACITY_SCANS + 5))], at + 1, "lost")
         with Source(link) as source:
             assert link.through.wait(10)
             taken = take_all(source)
@@ -248,15 +255,11 @@ class TestRecords:
 
     @pytest.mark.parametrize("kind", ["lost", "back", "trouble"])
     def test_a_notice_reaches_runtime_and_sinks_in_its_place(self, kind):
-        class Telling(FakeLink):
-            def notices(self):
-                return [Notice(0, kind, "told")] if self.reads == 5 else []
-
         order, runtime = [], make_runtime()
         runtime.lose_touch = lambda sensors, **_: order.append("lost touch")
         sink = ListSink(on_write=lambda result: order.append(result.scan.number))
         sink.tell = lambda event, counters: order.append((event.kind, event.text))
-        statistics = pumped(Telling([[scan] for scan in presses(range(10))]), sink, runtime=runtime)
+        statistics = pumped(Telling([[scan] for scan in presses(range(10))], 5, kind), sink, runtime=runtime)
         touch = ["lost touch"] if kind in ("lost", "silent", "back") else []
         assert order == [0, 1, 2, 3, *touch, (kind, "told"), *range(4, 10)]
         assert statistics.events == {kind: 1}
