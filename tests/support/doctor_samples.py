@@ -19,9 +19,9 @@ def healthy_counts(scans: int = 400, sigma: float = 2.0) -> np.ndarray:
     return np.rint(REST + noise).astype(np.int32)
 
 
-def times_ns(scans: int = 400, rate_hz: float = 100.0, seed: int = 1) -> np.ndarray:
+def times_ns(scans: int = 400, rate_hz: float = 100.0) -> np.ndarray:
     """Return times on a grid, each up to a millisecond early or late."""
-    jitter_s = np.random.default_rng(seed).uniform(-0.001, 0.001, scans)
+    jitter_s = np.random.default_rng(1).uniform(-0.001, 0.001, scans)
     return np.rint((np.arange(scans) / rate_hz + jitter_s + 1) * 1e9).astype(np.int64)
 
 
