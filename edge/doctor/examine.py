@@ -96,10 +96,10 @@ def check_baseline(
     """
     needed = zeroing.FEWEST_SCANS
     norm = f"{needed} scans that span at most {' / '.join(f'{limit:.0f}' for limit in zeroing.SPREAD_LIMIT_COUNTS)}"
-    if not living.any():
-        return None, Finding("baseline", "not known", "no taxel has arrived", norm)
-    silent = ~living.reshape(scans[0].fresh.shape)
-    usable = [scan for scan in scans if (scan.fresh | silent).all() and scan.renewed.any()][-needed:]
+    if not living.all():
+        lack = f"{np.count_nonzero(~living)} taxels have not arrived"
+        return None, Finding("baseline", "not known", lack, norm, "see silent taxels")
+    usable = [scan for scan in scans if scan.complete and scan.renewed.any()][-needed:]
     if len(usable) < needed:
         measured = f"only {len(usable)} complete scans"
         return None, Finding("baseline", "not known", measured, norm, "watch for longer: --drift-s 60")
@@ -107,15 +107,13 @@ def check_baseline(
     baseline = None
     try:
         for scan in usable:
-            baseline = estimator.push(scan, silent if silent.any() else None)
+            baseline = estimator.push(scan)
     except BaselineRefusedError as refusal:
         if spoiled is not None:
             return None, Finding("baseline", "not known", "the pad is not still", norm, f"see {spoiled}")
         measured, _, remedy = str(refusal).partition(": ")
         return None, Finding("baseline", "wrong", measured, norm, remedy)
-    whole = baseline is not None and not silent.any()
-    measured = f"{needed} scans agree" + ("" if whole else f" but for {np.count_nonzero(silent)} silent taxels")
-    return baseline if whole else None, Finding("baseline", "ok", measured, norm)
+    return baseline, Finding("baseline", "ok", f"{needed} scans agree", norm)
 
 
 def check_load(

@@ -31,6 +31,7 @@ def remedy_of(name, scans, **changes):
 
 
 NEW = {"references": {}}  # of a pad without an earlier baseline
+UNZEROED = {"baseline": "not known"}
 STUCK, TORN = {"stuck taxels": "wrong"}, {"torn scans": "wrong"}
 OLD = TORN | dict.fromkeys(("noise", "drift", "baseline"), "not known")
 SEAM = np.stack([np.zeros((4, 4), dtype=np.int32)] * 2 + [REST[2] - 65_535])
@@ -87,7 +88,7 @@ class TestSensor:
     @pytest.mark.parametrize(
         ("change", "given", "expected", "words"),
         [
-            (lambda counts: silenced(counts, [6]), {}, {"silent taxels": "wrong"}, "makes up for"),
+            (lambda counts: silenced(counts, [6]), {}, {"silent taxels": "wrong"} | UNZEROED, "makes up for"),
             (lambda counts: silenced(counts, [6], slice(0, 400, 10)), {}, TORN, "taxel 6 comes and goes"),
             (lambda counts: silenced(counts, [6, 9], slice(0, 400, 10)), {}, TORN, "frames are lost on the way"),
             (lambda counts: counts[np.arange(400) // 2 * 2], {}, TORN, "repeats itself"),
