@@ -4,11 +4,8 @@
         for result in Stream(source, open_runtime("stsr-int8", source)):
             print(result.force_counts)
 
-A control loop calls `stream.latest()` instead, which returns the newest result with its age and never waits.
-A source reads in a thread of its own; everything else happens in the thread that iterates and that makes the runtime. A
-request that cannot be met raises a BridgeError or an EdgeError with one clear line.
-
-`edge-sr` works through this module alone, except for its bench, its live page, and a doctor that asks for presses.
+A control loop calls `stream.latest()` instead, which returns the newest result with its age and never waits. A request
+that cannot be met raises a BridgeError or an EdgeError with one clear line.
 """
 
 import importlib
@@ -33,7 +30,7 @@ from edge.pipeline.commands import Command, Commands
 from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.result_stream import Latest, Stream, paired, pump
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.runtime_setup import infer, load_model, open_runtime
+from edge.pipeline.runtime_setup import infer, load_model, open_recording, open_runtime
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.pipeline.source_setup import links_to, sensor_settings
@@ -63,7 +60,6 @@ if TYPE_CHECKING:
     from edge.mapping.sink import MapSink, ObjectMap
     from edge.perception.patches import Patch, PatchEvent, PatchEvents, patches
     from edge.pipeline.baseline_capture import take_baselines
-    from edge.pipeline.replay_setup import open_recording
     from edge.pose_sources import PoseSource, open_poses
     from firmware_bridge.links.discovery import devices
 
@@ -73,7 +69,6 @@ _ON_USE: Final = {
     "edge.mapping.sink": ["MapSink", "ObjectMap"],
     "edge.perception.patches": ["Patch", "PatchEvent", "PatchEvents", "patches"],
     "edge.pipeline.baseline_capture": ["take_baselines"],
-    "edge.pipeline.replay_setup": ["open_recording"],
     "edge.pose_sources": ["PoseSource", "open_poses"],
     "firmware_bridge.links.discovery": ["devices"],
 }
@@ -110,24 +105,12 @@ def open_source(
 ) -> Source:
     """Return a source of scans for a with statement; it reopens links that are lost while it is open.
 
-    Args:
-        texts: the forms of `edge-sr --source`: "slcan:serial=D30BL366", "replay:FILE", "demo", ...; several with names,
-            "left=slcan:...". Without any, the adapter of the sensor file, or the one that is plugged in.
-        sensor: file that `edge-sr doctor` wrote. The mountings, baselines, counts per newton and pads in it hold for
-            every runtime of this source and take precedence over those in a recording.
-        id_map: assignment of CAN ids to taxels, and with it the pad: one of ID_MAPS, or a map of your own, as
-            `layout_c` makes one of a geometry.
-        rate_hz: rate at which a recording is played; for a device, the rate that sets the deadlines of its patterns,
-            in [Hz].
-        give_up_s: longest time that a lost or silent source may be away, in [s]; at 0 its loss is an error at once.
-
-    Raises:
-        SourceError: the form does not exist, a name occurs twice, or the sources are of several kinds.
-        NoDeviceError: there is no adapter, or there are several and none was named.
-        RecordingError: the recording cannot be used.
-        SensorFileError: the sensor file cannot be used.
-        UsageError: the id map does not exist or is not that of the sensor file; the rate or the time is out of range;
-            a source is not a text.
+    Texts are forms of `edge-sr --source`, several with names, "left=slcan:..."; without any it is the adapter of the
+    sensor file, or the one that is plugged in. What the doctor's `sensor` file states holds for every runtime of this
+    source, before what a recording states. The id map, one of ID_MAPS or one of your own, as of `layout_c`, gives
+    the pad, too. `rate_hz` is that at which a recording is played, and sets the deadlines of a device's patterns. A
+    source that is away for `give_up_s` [s] is an error, at 0 at once. Raises SourceError, NoDeviceError,
+    RecordingError, SensorFileError or UsageError.
     """
     if not give_up_s >= 0:
         raise UsageError(f"give_up_s is {give_up_s}, expected 0 or more")

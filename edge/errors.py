@@ -1,13 +1,4 @@
-"""Errors of the runtime.
-
-EdgeError
-+-- ModelError (ValueError)   a model that is missing, unreadable or breaks the contract
-+-- WindowError (ValueError)  an input that cannot be inferred from: wrong shape or type, or not finite
-+-- UsageError (ValueError)   a request of the caller that cannot be met
-+-- NoResultError (TimeoutError)  no new result in time
-+-- SinkError (OSError)       a sink that cannot be opened or written
-    +-- SinkClosedError       the reader of the sink has gone
-"""
+"""Errors of the runtime: EdgeError, and leaves that are also the builtin that fits."""
 
 from firmware_bridge.errors import harmless
 

@@ -26,10 +26,7 @@ _WITHOUT: Final = {
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
-    """Write a recording in the format that the new name ends in, as CSV a file for each sensor.
-
-    Of a new file that cannot be written nothing is left.
-    """
+    """Write a recording in the format that the new name ends in, as CSV a file for each sensor."""
     source, target = Path(options.recording), Path(options.new)
     ending = target.suffix.lower()
     if source.suffix.lower() != ".mcap":

@@ -49,41 +49,17 @@ def _key(counts: NDArray[np.integer]) -> bytes:
     return counts.astype(np.int32).tobytes()
 
 
-class DemoScenes:
-    """Announcement of each scene of the demo, as events of kind "note"."""
-
-    def __init__(self, recording: DemoRecording, tell: Callable[[Event], object], reset: Callable[[], object]) -> None:
-        """Begin before the first scene; `reset` is called where the robot goes to another object and back."""
-        self._recording, self._tell, self._reset = recording, tell, reset
-        self._scene = FREE
-
-    def add(self, result: Result) -> None:
-        """Follow the scenes."""
-        scene = self._recording.scenes.get(_key(result.scan.counts), self._scene)
-        if scene == self._scene:
-            return
-        if SLIDE in (scene, self._scene):
-            self._reset()
-        self._scene = scene
-        if scene in _BEGINS:
-            self._tell(Event(time.monotonic_ns(), "note", None, f"demo: {_BEGINS[scene]}"))
-
-
 @dataclass(frozen=True, slots=True)
 class TapScore:
-    """Error of one tap's pattern against its truth, (H, W) in the model's unit, at the tap's peak.
+    """Error of one tap's pattern against its truth, (H, W) in the model's unit, at the tap's peak."""
 
-    The tap is numbered from 0; its pose is x and y in [mm] and turn in [deg], as the robot stated them. Errors are in
-    [dB] and in [% of full scale]; `alone_percent` is that of a pattern of this tap alone.
-    """
-
-    tap: int
-    pose: tuple[float, float, float]
+    tap: int  # from 0
+    pose: tuple[float, float, float]  # x and y in [mm], and turn in [deg], as the robot stated them
     result: Result
     truth: NDArray[np.float32]
     psnr_db: float
-    rmse_percent: float
-    alone_percent: float
+    rmse_percent: float  # of full scale
+    alone_percent: float  # likewise, of a pattern of this tap alone
 
 
 class DemoScore:
@@ -137,37 +113,26 @@ class DemoScore:
         return self._model.run(window)
 
     def text(self) -> str:
-        """Return the table of the scores."""
+        """Return a table with a line for each tap, 50 columns wide, and what the taps together are worth."""
         scores, of = self.scores(), f"of {self._recording.figure_taps} taps scored"
         if not scores:
             return f"none {of}: the run ended before a tap had a pattern"
-        return f"{len(scores)} {of} at their peak, against the simulated truth:\n{score_table(scores)}"
-
-
-def score_table(scores: Sequence[TapScore]) -> str:
-    """Return the scores as a table with a line for each tap, 50 columns wide, and what the taps together are worth.
-
-    RMSE in [% of full scale], of the pattern and of one from the same tap alone; "+-" is the model's own estimate, half
-    the 90 % interval of touched pixels in [um].
-    """
-    lines = ["tap    x    y turn use   PSNR  RMSE alone  +- time", "      mm   mm  deg taps    dB   %fs   %fs  um   us"]
-    for score in scores:
-        interval_mm = score.result.interval_mm
-        interval = "-" if interval_mm is None else f"{1000 * interval_mm:.0f}"
-        x_mm, y_mm, turn_deg = score.pose
-        figures = f"{score.psnr_db:6.2f} {score.rmse_percent:5.2f} {score.alone_percent:5.2f}"
-        place = f"{score.tap + 1:3d} {x_mm:4.1f} {y_mm:4.1f} {turn_deg:4.0f} {score.result.taps_used:3d}"
-        lines.append(f"{place} {figures} {interval:>3s} {score.result.run_time_us or 0:4.0f}")
-    return "\n".join([*lines, _gained(scores)])
-
-
-def _gained(scores: Sequence[TapScore]) -> str:
-    """Return what the earlier taps have changed, also where it is nothing good."""
-    last = scores[-1]
-    if last.result.taps_used < 2:
-        return "Each pattern is of one tap: the model takes one, or the earlier ones were dropped."
-    alone = f"by itself the last tap is {last.alone_percent:.2f} % of full scale off"
-    return f"With all {last.result.taps_used} taps the pattern is {last.rmse_percent:.2f} % of full scale off; {alone}."
+        lines = [f"{len(scores)} {of} at their peak, against the simulated truth:"]
+        lines.append("tap    x    y turn use   PSNR  RMSE alone  +- time")
+        lines.append("      mm   mm  deg taps    dB   %fs   %fs  um   us")
+        for score in scores:
+            interval_mm = score.result.interval_mm
+            interval = "-" if interval_mm is None else f"{1000 * interval_mm:.0f}"  # half of 90 %, of touched pixels
+            x_mm, y_mm, turn_deg = score.pose
+            figures = f"{score.psnr_db:6.2f} {score.rmse_percent:5.2f} {score.alone_percent:5.2f}"
+            place = f"{score.tap + 1:3d} {x_mm:4.1f} {y_mm:4.1f} {turn_deg:4.0f} {score.result.taps_used:3d}"
+            lines.append(f"{place} {figures} {interval:>3s} {score.result.run_time_us or 0:4.0f}")
+        last, off = scores[-1], "% of full scale off"
+        gained = f"With all {last.result.taps_used} taps the pattern is {last.rmse_percent:.2f} {off}; by itself the "
+        gained += f"last tap is {last.alone_percent:.2f} {off}."
+        if last.result.taps_used < 2:
+            gained = "Each pattern is of one tap: the model takes one, or the earlier ones were dropped."
+        return "\n".join([*lines, gained])
 
 
 class DemoMap(MapSink):
@@ -205,13 +170,7 @@ class DemoMap(MapSink):
 
 
 class Demo(Sink):
-    """Sink that makes a run the demo; it prints to `stream`, and shows its map on the live page, if there is one.
-
-    Where it `loops`, it goes on after its end, and each part is printed once it is complete.
-
-    Attributes:
-        map: made where the user makes none; a sink of its own.
-    """
+    """Sink that makes a run the demo; it prints to `stream`, and shows its map on the live page, if there is one."""
 
     def __init__(
         self,
@@ -224,33 +183,39 @@ class Demo(Sink):
         loops: bool,
         maps: bool,
     ) -> None:
-        """Begin the demo; scenes are announced to the sinks that are `watching`."""
+        """Begin the demo, announced to sinks that are `watching`; one that `loops` prints a part once that is over."""
         self._recording = recording = DemoRecording(demo_recording())
-        self._stream, self._view, self._loops = stream, view, loops
-        self._score = DemoScore(recording, model)
+        self._stream, self._view, self._watching, self._commands, self._loops = stream, view, watching, commands, loops
+        self._scene = FREE
+        self.score = DemoScore(recording, model)
         if view is not None:
-            view.show_truth(self._score.truth)
+            view.show_truth(self.score.truth)
+        # A sink of its own, where the user makes no map.
         self.map = DemoMap(recording, None if view is None else view.show_map) if maps else None
-        self._unprinted = [self._score, *([] if self.map is None else [self.map])]
-
-        def tell(event: Event) -> None:
-            for sink in watching:
-                sink.tell(event, {})
-
-        self._scenes = DemoScenes(recording, tell, lambda: commands.put(RESET))
+        self._unprinted = [self.score, *([] if self.map is None else [self.map])]
         taps = f"{str(recording.arrays['surface'])!r} {recording.figure_taps} times"
         sys.stderr.write(f"demo: an emulated sensor taps {taps}, turned by 5 degrees each time, zeroed first\n")
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Follow the demo."""
-        self._score.add(result)
-        self._scenes.add(result)
+        self.score.add(result)
+        self._announce(self._recording.scenes.get(_key(result.scan.counts), self._scene))
         complete = [part for part in self._unprinted if part.complete] if self._loops else []
         for part in complete:
             self._print(part)
         if complete and not self._unprinted:
             page = "" if self._view is None else f"live page: {self._view.url}; "
             sys.stderr.write(f"\n{page}the demo continues until Ctrl-C\n")
+
+    def _announce(self, scene: int) -> None:
+        """Announce the next scene; where the robot goes to another object and back, earlier taps are forgotten."""
+        before, self._scene = self._scene, scene
+        if scene != before and SLIDE in (scene, before):
+            self._commands.put(RESET)
+        if scene != before and scene in _BEGINS:
+            event = Event(time.monotonic_ns(), "note", None, f"demo: {_BEGINS[scene]}")
+            for sink in self._watching:
+                sink.tell(event, {})
 
     def finish(self) -> None:
         """Print what was not printed while the demo went on."""

@@ -24,10 +24,7 @@ SERVER_HINT = "The vendor's server, where one runs, is not searched for: --sourc
 
 
 def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
-    """Print the bundled models with their error, and with --measure their run time on this machine.
-
-    Raises ModelError if there is none, or one cannot be used.
-    """
+    """Print the bundled models with their error, and with --measure their run time on this machine."""
     paths = bundled_models()
     if not paths:
         raise ModelError("no models are bundled with this installation")
@@ -53,10 +50,7 @@ def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 
 
 def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
-    """Return median and 99th percentile of each model's run time in [us], each run at its tick as on a robot.
-
-    Windows are random, with all taps: run time does not depend on their values.
-    """
+    """Return median and 99th percentile of each model's run time in [us] on random windows, paced as on a robot."""
     rng, made = np.random.default_rng(1), list[tuple[float, float]]()
     for model in tracked(models, "run times", "model"):
         contract = model.contract
@@ -74,10 +68,7 @@ def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
 
 
 def show_devices(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
-    """Print the devices, opening none, what to type to read each, and what prevents its use.
-
-    Raises DeviceError if no adapter is among them.
-    """
+    """Print the devices, opening none, what to type to read each, and what prevents its use."""
     listed, notes = devices()
     out.write("".join(f"{line}\n" for line in page(listed, notes, columns())))
     if not any(device.adapter for device in listed):

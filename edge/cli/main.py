@@ -27,7 +27,7 @@ from firmware_bridge.errors import harmless
 
 STDIN, STDOUT, STDERR = 0, 1, 2
 _FIXED: Final[dict[str, dict[str, Any]]] = {
-    "demo": {"sensor": None, "id_map": None, "baseline": None, "poses": [], "give_up_s": None},
+    "demo": {"source": ["demo"], "sensor": None, "id_map": None, "baseline": None, "poses": [], "give_up_s": None},
     "replay": {"source": [], "id_map": None, "give_up_s": None, "poses": []},
 }
 """Options of a run that a command of its kind does not have, with the values that they have there."""
@@ -131,10 +131,7 @@ def parsed_options(command: str, arguments: Sequence[str]) -> argparse.Namespace
 
 
 def _open_closed_streams() -> None:
-    """Open placeholders for closed standard streams, or the next file would take their number: a port, or the records.
-
-    Python's messages for a closed stderr would else go to stdout, between records.
-    """
+    """Open placeholders for closed standard streams, or the next file, such as a port, would take their number."""
     # Writing to stdout still fails, so that results are not lost without a message; stderr discards its text.
     for number, mode in ((STDIN, os.O_RDONLY), (STDOUT, os.O_RDONLY), (STDERR, os.O_WRONLY)):
         with contextlib.suppress(OSError):
@@ -147,11 +144,7 @@ def _open_closed_streams() -> None:
 
 @contextlib.contextmanager
 def _guarded_streams() -> Iterator[None]:
-    """Replace stdout by one whose faults are those of a sink, and stderr by one without, in a with statement.
-
-    Text that nobody can read ends no run. A reader of stdout that has had enough ends the block, without a message; a
-    stdout that cannot be written raises SinkError.
-    """
+    """Let faults of stdout raise a SinkError, unless its reader has had enough, and those of stderr end nothing."""
     streams = sys.stdout, sys.stderr
     sys.stdout = cast("TextIO", _Guarded(streams[0], _refuse_stdout))
     sys.stderr = cast("TextIO", _Guarded(streams[1], lambda error: _stand_in(streams[1], STDERR)))
@@ -182,17 +175,11 @@ def _refuse_stdout(error: OSError) -> None:
 
 
 class _Guarded:
-    """Stream that escapes control characters, and whose faults are handled.
-
-    All printed text passes here, and much of it holds names and texts of files, devices and models.
-
-    Attributes:
-        drawn: the same stream for text with control characters of our own.
-    """
+    """Stream that escapes control characters, as may be in names of files, devices and models, and handles faults."""
 
     def __init__(self, stream: TextIO, refuse: Callable[[OSError], None], *, escapes: bool = True) -> None:
         self._stream, self._refuse, self._escapes = stream, refuse, escapes
-        self.drawn = type(self)(stream, refuse, escapes=False) if escapes else self
+        self.drawn = type(self)(stream, refuse, escapes=False) if escapes else self  # for control characters of ours
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)

@@ -96,7 +96,6 @@ RUN: Final = (
     ),
     *RESULTS,
 )
-# fmt: on
 
 
 class Subcommand(NamedTuple):
@@ -159,11 +158,11 @@ lines on stdin, where it is no terminal:
 The signal SIGUSR1 is like key z.
 
 {EXAMPLES}
-Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
+Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 137 ended by force.
 """,
     ),
     "demo": Subcommand(
-        "edge.cli.run_command:show_demo",
+        "edge.cli.run_command:follow",
         "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
         "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
         (Group("sensor", Option("--rate-hz R", positive, "scans a second (default 100)")), *RESULTS),
@@ -177,23 +176,15 @@ Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
     "replay": Subcommand(
         "edge.cli.run_command:replay",
         "Computes the patterns of a recording.",
-        (
-            Group(
-                "recording",
-                Option(
-                    "file FILE",
-                    str,
-                    "recording, .mcap, .npz or .csv; of several sensors a file each, also as FILE,FILE",
-                    nargs="*",
-                ),
-                Option("--example", bool, "play what is bundled: two emulated fingers grip a pen and a nut"),
-                Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline (default: recorded)"),
-                Option("--paced", bool, "play at the original speed, with current times; so does --view with a --sink"),
-                Option("--sensor FILE", Path, "sensor file of edge-sr doctor, instead of the recorded order and axes"),
-                Option("--rate-hz R", positive, "scans a second, if the file does not state it or with --paced"),
-            ),
-            *RESULTS,
-        ),
+        (Group("recording",
+            Option("file FILE", str, "recording, .mcap, .npz or .csv; of several sensors a file each, also as "
+                   "FILE,FILE", nargs="*"),
+            Option("--example", bool, "play what is bundled: two emulated fingers grip a pen and a nut"),
+            Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline (default: recorded)"),
+            Option("--paced", bool, "play at the original speed, with current times; so does --view with a --sink"),
+            Option("--sensor FILE", Path, "sensor file of edge-sr doctor, instead of the recorded order and axes"),
+            Option("--rate-hz R", positive, "scans a second, if the file does not state it or with --paced"),
+        ), *RESULTS),
         """\
 Computes a result for every scan, as fast as possible, with the times of the recording. It begins \
 with the baseline (the readings of the free pad) that was in use at the first scan. If there is none, and the \
@@ -205,13 +196,10 @@ With --view and no --sink it is played at its own speed, from when the page is o
     "convert": Subcommand(
         "edge.cli.convert_command:run",
         "Writes an .mcap in another format: that of the ending of the new name.",
-        (
-            Group(
-                "recording",
-                Option("recording FILE", str, "recording, .mcap"),
-                Option("new NEW", str, "new file, .npz or .csv"),
-            ),
-        ),
+        (Group("recording",
+            Option("recording FILE", str, "recording, .mcap"),
+            Option("new NEW", str, "new file, .npz or .csv"),
+        ),),
         """\
 Formats: .npz holds arrays for numpy, .csv counts, times and poses of one sensor (of several a file each). What the \
 new file cannot hold is printed. Nothing is computed, and no file is replaced.
@@ -220,22 +208,13 @@ new file cannot hold is printed. Nothing is computed, and no file is replaced.
     "map": Subcommand(
         "edge.cli.run_command:map_object",
         "Runs like edge-sr, and fuses the patterns into a map of the object.",
-        (
-            Group(
-                "map",
-                Option("--out FILE", Path, "file for the map's layers (default %(default)s)", default=Path("map.npz")),
-                Option("--size-mm L", positive, "length of its sides in mm (default %(default)g)", default=SIZE_MM),
-                Option("--px-per-mm N", positive, "pixels of the map per mm (default %(default)g)", default=PX_PER_MM),
-                Option(
-                    "--centre-mm X Y",
-                    float,
-                    "x and y of its centre in the object's plane, in mm (default 0 0)",
-                    nargs=2,
-                    default=(0.0, 0.0),
-                ),
-            ),
-            *RUN,
-        ),
+        (Group("map",
+            Option("--out FILE", Path, "file for the map's layers (default %(default)s)", default=Path("map.npz")),
+            Option("--size-mm L", positive, "length of its sides in mm (default %(default)g)", default=SIZE_MM),
+            Option("--px-per-mm N", positive, "pixels of the map per mm (default %(default)g)", default=PX_PER_MM),
+            Option("--centre-mm X Y", float, "x and y of its centre in the object's plane, in mm (default 0 0)",
+                   nargs=2, default=(0.0, 0.0)),
+        ), *RUN),
         f"""\
 Needs poses of the pad (where it is, and how it is turned) in the object's plane: lines on stdin, or those of a \
 recording. x points right and y down, as in a pattern. A line of poses:
@@ -252,10 +231,8 @@ recording. x points right and y down, as in a pattern. A line of poses:
     "baseline": Subcommand(
         "edge.cli.run_command:baseline",
         "Measures the free pad once, and stores its readings: the baseline, which is subtracted from each scan.",
-        (
-            Group("sensor", *SENSOR),
-            Group("baseline", Option("--out FILE", Path, "file for the baseline", required=True)),
-        ),
+        (Group("sensor", *SENSOR),
+         Group("baseline", Option("--out FILE", Path, "file for the baseline", required=True))),
         "Keep the pad still, with nothing touching it. Of a recording it takes the scans in which the pad is still and "
         "pressed least.",
     ),
@@ -269,25 +246,17 @@ recording. x points right and y down, as in a pattern. A line of poses:
     "doctor": Subcommand(
         "edge.doctor.command:run",
         "Examines sensor and adapter, reports faults with their remedies, and measures how the pad is mounted.",
-        (
-            Group(
-                "sensor",
-                *SENSOR,
-                Option("--baseline FILE", Path, "earlier readings of the free pad, to detect a load on it"),
-            ),
-            Group(
-                "what is measured",
-                Option("--drift-s T", positive, "seconds to measure the free pad (default %(default)g)", default=60),
-                Option("--no-press", bool, "skip the presses on the corners"),
-                Option("--rehearse", bool, "on an emulated pad that does what is asked: no sensor is needed"),
-            ),
-            Group(
-                "results",
-                Option("--out FILE", Path, "write the results into a sensor file"),
-                Option("--json", bool, "write one JSON document to stdout"),
-                Option("--forget-gains SENSOR", str, "remove its learned gains from the file of --sensor, and end"),
-            ),
-        ),
+        (Group("sensor", *SENSOR,
+            Option("--baseline FILE", Path, "earlier readings of the free pad, to detect a load on it"),
+        ), Group("what is measured",
+            Option("--drift-s T", positive, "seconds to measure the free pad (default %(default)g)", default=60),
+            Option("--no-press", bool, "skip the presses on the corners"),
+            Option("--rehearse", bool, "on an emulated pad that does what is asked: no sensor is needed"),
+        ), Group("results",
+            Option("--out FILE", Path, "write the results into a sensor file"),
+            Option("--json", bool, "write one JSON document to stdout"),
+            Option("--forget-gains SENSOR", str, "remove its learned gains from the file of --sensor, and end"),
+        )),
         """\
 Keep the pad still, with nothing touching it, until you are asked to press its corners. Hold it in the \
 orientation in which patterns are to be drawn: it defines top and left.
@@ -307,15 +276,12 @@ Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong 
     "bench": Subcommand(
         "edge.bench.command:run",
         "Measures error against run time of the bundled models and of methods without a network.",
-        (
-            Group(
-                None,
-                Option("--out DIR", Path, "folder for bench.csv and bench.md"),
-                Option("--ticks N", whole(10), "paced ticks a row (default 3000)", default=3000),
-                Option("--models DIR", Path, "folder of your own models, measured as well"),
-                Option("--only NAME", str, "measure only these methods", nargs="+"),
-            ),
-        ),
+        (Group(None,
+            Option("--out DIR", Path, "folder for bench.csv and bench.md"),
+            Option("--ticks N", whole(10), "paced ticks a row (default 3000)", default=3000),
+            Option("--models DIR", Path, "folder of your own models, measured as well"),
+            Option("--only NAME", str, "measure only these methods", nargs="+"),
+        ),),
         """\
 Run time is measured back to back, and paced: one inference a tick, at 100 Hz, as on a robot. A row takes half a \
 minute. No other program should run meanwhile.
@@ -324,6 +290,7 @@ Ctrl-C ends it with exit code 130, after the rows measured so far are written.
 """,
     ),
 }
+# fmt: on
 COMMANDS: Final = (*filter(None, TABLE),)
 
 

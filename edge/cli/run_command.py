@@ -1,7 +1,4 @@
-"""Run of `edge-sr`: a source through the runtime into sinks, and its summary.
-
-Modules that only some runs need are imported where they are used.
-"""
+"""Run of `edge-sr`: a source through the runtime into sinks, and its summary; what only some runs need loads late."""
 
 import argparse
 import contextlib
@@ -34,6 +31,7 @@ from edge.api import (
     find_model,
     load_baselines,
     load_model,
+    open_recording,
     open_runtime,
     open_sink,
     open_source,
@@ -71,16 +69,9 @@ def follow(
     run(options, _source(options, inf if options.give_up_s is None else options.give_up_s), statistics, mapping)
 
 
-def show_demo(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
-    """Run `edge-sr demo`."""
-    options.source = ["demo"]
-    follow(options, out, err)
-
-
 def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Run `edge-sr replay`."""
     from edge.api import example_recording
-    from edge.pipeline.replay_setup import open_recording
 
     files = [*options.file, *[example_recording()] * options.example]
     if not files:
@@ -109,7 +100,8 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
             if FILE_FORMAT.encode() not in file.read(1 << 16):
                 raise UsageError(f"{options.out} holds something else: give another name, or delete it first")
     if len(options.source) == 1 and options.source[0].startswith("replay:"):
-        from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
+        from edge.pipeline.baseline_capture import recorded_baselines
+        from edge.pipeline.source_setup import sensor_settings
 
         kind, sensor_file = "replay", sensor_settings(options.sensor, options.id_map)
         played = options.source[0].removeprefix("replay:")
@@ -184,11 +176,7 @@ def run(
     mapping: "MapSink | None" = None,
     looked_at: threading.Event | None = None,
 ) -> None:
-    """Run `edge-sr` without a command, or a command that runs the same way, with a source that is not open yet.
-
-    `statistics` are filled on the way, so that they are available however the run ends. `mapping` takes the results
-    into a map, which the live page shows; it is closed here. `looked_at` is set once somebody looks at that page.
-    """
+    """Run a source that is not open yet into the sinks asked for, and `mapping`, which is closed here, into a map."""
     statistics = Statistics() if statistics is None else statistics
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
     loops = options.source == [DEMO_LOOP]
@@ -229,7 +217,9 @@ def run(
                 asked = replace(asked, every_scan=True)  # it shows the run time of every scan
             settings = {"baselines": baselines, "counts_per_newton": options.counts_per_newton}
             runtime = open_runtime(model, source, **settings, **asdict(asked))
-            give_back_memory()
+            # Free memory goes back to the system, by glibc alone: a network takes more while it is loaded.
+            if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+                trim(ctypes.c_size_t(0))
             sinks: list[Sink] = []
             if played is not None:
                 sinks += [played, *([] if played.map is None else [played.map])]
@@ -267,12 +257,6 @@ def run(
             raise DeviceError(f"no scan came from {source.name}: {hint()}")
         if played is not None:
             played.finish()
-
-
-def give_back_memory() -> None:
-    """Give free memory back to the system, by glibc alone: a network takes more while it is loaded than afterwards."""
-    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
-        trim(ctypes.c_size_t(0))
 
 
 def _open_view(

@@ -21,7 +21,6 @@ from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.grip import ASK as GRIP
 from edge.doctor.grip import Grip
 from edge.doctor.guided_press import (
-    PARTLY_ERROR,
     PATIENCE_S,
     GuidedPress,
     Weighed,
@@ -55,16 +54,11 @@ def typed_line() -> str | None:
 
 
 def _stdin_is_terminal() -> bool:
-    # Only on POSIX can a terminal be polled for input.
-    return os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
+    return sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
 class Visit:
-    """Visit to the sensors of one link: what is asked of a person, and what that gives.
-
-    `mountings` are corrections of the mountings, and `weighed` the counts per newton of those that were weighed, by
-    sensor; `unfinished` is true when a measurement was asked of a person, and not made.
-    """
+    """Visit to the sensors of one link: what is asked of a person, and what that gives."""
 
     def __init__(
         self,
@@ -76,9 +70,9 @@ class Visit:
         rehearsal: Rehearsal | None,
     ) -> None:
         """Prepare the visit; requests to a person, or to a `rehearsal`, go to `err`."""
-        self.mountings: dict[str, Mounting] = {}
-        self.weighed: dict[str, Weighed] = {}
-        self.unfinished = False
+        self.mountings: dict[str, Mounting] = {}  # corrections, by sensor
+        self.weighed: dict[str, Weighed] = {}  # counts per newton, by sensor
+        self.unfinished = False  # a measurement was asked of a person, and not made
         self._options, self._reader, self._sensor_file = options, reader, sensor_file
         self._link = reader.link
         self._err, self._stop, self._rehearsal = err, stop, rehearsal
@@ -103,7 +97,7 @@ class Visit:
 
     def _press_one(self, name: str, whose: str, examined: Examined) -> None:
         geometry, answers = self._sensor_file.geometry, self._rehearsal is not None or _stdin_is_terminal()
-        guide = GuidedPress(geometry, weigh=answers, z_noise_counts=examined.z_noise_counts[name])
+        guide = GuidedPress(geometry, weigh=answers)
         skips = " Enter skips a request." * (self._rehearsal is None and _stdin_is_terminal())
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.{skips}")
         self._lead(guide, name, examined, whose)
@@ -135,10 +129,9 @@ class Visit:
                     grip.push(scan.sensor, scan.time_ns / NS_PER_S, float(np.nansum(zeroed[2])))
             if typed_line() is not None:
                 return
-        scales = {name: Weighed(value, PARTLY_ERROR) for name, value in self._sensor_file.counts_per_newton.items()}
-        for name, (low, high) in self._sensor_file.scale_intervals.items():
-            value = scales[name].counts_per_newton
-            scales[name] = Weighed(value, max(high - value, value - low) / value)
+        weighed, scales = self._sensor_file.counts_per_newton, dict[str, Weighed]()
+        for name, (low, high) in self._sensor_file.scale_intervals.items():  # without one it is no measured scale
+            scales[name] = Weighed(weighed[name], (high - low) / 2 / weighed[name])
         examined.findings.extend(grip.judge(scales | self.weighed))
         self.weighed.update(grip.weighed)
 
@@ -186,11 +179,7 @@ class Visit:
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
-    """Run `edge-sr doctor`; returns the exit code. Findings go to `out`, requests to a person to `err`, if a terminal.
-
-    A link that was lost, and a sensor file that could not be written in the end, are raised after the findings were
-    printed.
-    """
+    """Run `edge-sr doctor`; return the exit code. A link that was lost is raised after the findings were printed."""
     if options.forget_gains is not None:
         if options.sensor is None:
             raise UsageError("--forget-gains is of a sensor file, which was not named: add --sensor FILE")
@@ -272,11 +261,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
 
 
 def check_writable(path: Path, sensor_file: SensorFile) -> None:
-    """Check that a file may be written, before minutes are spent on its content.
-
-    It is a new one, or that of `sensor_file`, of which all is kept that is not measured again. Raises SensorFileError
-    for another, and for one that cannot be written.
-    """
+    """Raise a SensorFileError for a file that cannot be written, and for one that is not `sensor_file`'s."""
     try:
         in_place.check_writable(path)
     except OSError as error:
@@ -310,10 +295,9 @@ def keep(
     *,
     emulated: bool = False,
 ) -> SensorFile:
-    """Write the `sensor_file` from before with the new results, by sensor, and return it as written.
+    """Write the `sensor_file` from before with the new results, by sensor, and return it, or raise a SensorFileError.
 
-    `port` is that of the adapter, whose serial number is kept where it has one; baselines are of the free pads as they
-    were read, and `mountings` are corrections of those before. Raises SensorFileError where it cannot be written.
+    `port` is that of the adapter. Baselines are as they were read; `mountings` correct those before.
     """
     with changing(path):
         entries, as_wired = dict(sensor_file.sensors), Mounting(taxel_count=sensor_file.geometry.taxel_count)

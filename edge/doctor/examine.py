@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -37,16 +37,11 @@ _PRESSED: Final = (
 
 @dataclass(frozen=True)
 class Examined:
-    """Findings of link and sensors, and by sensor the baselines of the pads that may be zeroed.
-
-    The pads of `loaded` sensors are not free, as an earlier baseline shows. `z_noise_counts` are the standard
-    deviations of each sensor's summed z.
-    """
+    """Findings of link and sensors, and what the guided press needs of each sensor."""
 
     findings: list[Finding]
-    baselines: dict[str, Baseline]
-    loaded: frozenset[str] = frozenset()
-    z_noise_counts: Mapping[str, float] = field(default_factory=dict)
+    baselines: dict[str, Baseline]  # of the pads that may be zeroed
+    loaded: frozenset[str]  # sensors whose pads are not free, as an earlier baseline shows
 
 
 def judge(watched: Watched, unix_time_s: float) -> Examined:
@@ -89,24 +84,22 @@ def judge(watched: Watched, unix_time_s: float) -> Examined:
             baselines[name] = baseline
         findings += [replace(finding, sensor=name) for finding in of_sensor]
     loaded = frozenset(finding.sensor for finding in findings if finding.remedy == _PRESSED and finding.sensor)
-    noise_counts = {name: samples.z_sum_noise_counts() for name, samples in enough.items()}
-    return Examined(findings, baselines, loaded, noise_counts)
+    return Examined(findings, baselines, loaded)
 
 
 def check_baseline(
     scans: Sequence[Scan], living: NDArray[np.bool_], spoiled: str | None, unix_time_s: float
 ) -> tuple[Baseline | None, Finding]:
-    """Return the baseline of the last scans if the pad can be zeroed, and the finding on it.
+    """Return the baseline of the last scans if all taxels are `living` and the pad can be zeroed, and the finding.
 
-    There is one only if all taxels are `living`; `spoiled` names another finding that explains a refusal. The last scan
-    was at `unix_time_s`, in [s] since 1970.
+    `spoiled` names another finding that explains a refusal; `unix_time_s` is the time of the last scan since 1970.
     """
     needed = zeroing.FEWEST_SCANS
     norm = f"{needed} scans that span at most {' / '.join(f'{limit:.0f}' for limit in zeroing.SPREAD_LIMIT_COUNTS)}"
-    if not living.any():
-        return None, Finding("baseline", "not known", "no taxel has arrived", norm)
-    silent = ~living.reshape(scans[0].fresh.shape)
-    usable = [scan for scan in scans if (scan.fresh | silent).all() and scan.renewed.any()][-needed:]
+    if not living.all():
+        lack = f"{np.count_nonzero(~living)} taxels have not arrived"
+        return None, Finding("baseline", "not known", lack, norm, "see silent taxels")
+    usable = [scan for scan in scans if scan.complete and scan.renewed.any()][-needed:]
     if len(usable) < needed:
         measured = f"only {len(usable)} complete scans"
         return None, Finding("baseline", "not known", measured, norm, "watch for longer: --drift-s 60")
@@ -114,25 +107,19 @@ def check_baseline(
     baseline = None
     try:
         for scan in usable:
-            baseline = estimator.push(scan, silent if silent.any() else None)
+            baseline = estimator.push(scan)
     except BaselineRefusedError as refusal:
         if spoiled is not None:
             return None, Finding("baseline", "not known", "the pad is not still", norm, f"see {spoiled}")
         measured, _, remedy = str(refusal).partition(": ")
         return None, Finding("baseline", "wrong", measured, norm, remedy)
-    whole = baseline is not None and not silent.any()
-    measured = f"{needed} scans agree" + ("" if whole else f" but for {np.count_nonzero(silent)} silent taxels")
-    return baseline if whole else None, Finding("baseline", "ok", measured, norm)
+    return baseline, Finding("baseline", "ok", f"{needed} scans agree", norm)
 
 
 def check_load(
     rest_counts: NDArray[np.float64], reference: Baseline | None, mounting: Mounting | None = None
 ) -> Finding:
-    """Check whether something lies on the pad; only an earlier baseline of the free pad can show it.
-
-    The rest now is (3, taxels), NaN where silent. The mounting gives the direction of z, which tells a load now from
-    one then; without one it is as wired.
-    """
+    """Check by an earlier baseline whether something lies on the pad; its rest is (3, taxels), NaN where silent."""
     norm = f"z within {LOAD_LIMIT_COUNTS:.0f} counts of the baseline before"
     if reference is None:
         remedy = "a pad that was loaded from the start looks free; pass an earlier --baseline or --sensor"
@@ -150,11 +137,7 @@ def check_load(
 def prepare(
     texts: Sequence[str], sensor_file: SensorFile, before: Mapping[str, Baseline], rate_hz: float | None
 ) -> tuple[LinkReader, SensorFile, Watched]:
-    """Return a reader of the link to the source that `texts` names, the facts on its sensors, and an empty watch of it.
-
-    `before` holds earlier baselines of the free pads, by sensor; `rate_hz` is expected of each sensor, in [Hz]. Raises
-    what source_setup.links_to raises, and UsageError for several sources.
-    """
+    """Return a reader of the link to the source that `texts` names, its sensors' settings, and an empty watch of it."""
     if len(texts) > 1:
         raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
     check_baselines(before, sensor_file.model_map.geometry)
@@ -195,12 +178,8 @@ def examine(
 ) -> list[Finding]:
     """Watch free, still pads and report faults of sensor and adapter, as `edge-sr doctor` does without a person.
 
-    The source is one of `open_source`, which no other program may read meanwhile; `rate_hz` is expected of each sensor,
-    and `baselines` of the free pads, or their file, are by default those of the sensor file. `stop` ends it early.
-
-    Raises:
-        BridgeError: as for `open_source`; LinkLostError if the link is lost meanwhile.
-        UsageError: as for `open_source`; several sources, or baselines or a duration that are out of range.
+    The source is one of `open_source`, with its errors; no other program may read it meanwhile. `rate_hz` is expected
+    of each sensor, and `baselines` of the free pads, or their file, are by default those of the sensor file.
     """
     check_positive("duration_s", duration_s)
     sensor_file = sensor_settings(sensor, id_map)

@@ -16,14 +16,10 @@ FREE_SCANS: Final = 20
 
 
 class Grip:
-    """Course of one grip, by the summed z of two pads in counts over their baselines.
-
-    Attributes:
-        weighed: counts per newton of a pad that was not weighed, by those of its partner; empty before `judge`.
-    """
+    """Course of one grip, by the summed z of two pads in counts over their baselines."""
 
     def __init__(self, names: tuple[str, str]) -> None:
-        self.weighed: dict[str, Weighed] = {}
+        self.weighed: dict[str, Weighed] = {}  # after `judge` that of a pad without a weight, by its partner's
         self._names = names
         self._z: dict[str, list[tuple[float, float]]] = {name: [] for name in names}  # (time in [s], counts)
 

@@ -5,7 +5,7 @@ the middle of the pad, its surface moves along both axes, and each corner has an
 readings fits only one axis and one direction, and any three corners settle which.
 """
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Collection, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple, TypeVar
 
@@ -33,10 +33,7 @@ class Press:
 
 
 def orders(geometry: SensorGeometry = USPA44) -> dict[str, tuple[int, ...]]:
-    """Return the orientations in which a pad can lie, by name; each gives the taxel of every place.
-
-    There are eight, and four where the pad is not square: a quarter turn would make another grid of it.
-    """
+    """Return the eight orientations in which a pad can lie, four if not square, by name: the taxel of every place."""
     grid = np.arange(geometry.taxel_count).reshape(geometry.rows, geometry.cols)
     orientations: dict[str, tuple[int, ...]] = {}
     for mirrored in (False, True):
@@ -90,12 +87,6 @@ def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> tu
     return None
 
 
-def z_sign(presses: Sequence[Press]) -> int | None:
-    """Return 1 if z rises under every press, -1 if it falls under every one; None where they contradict each other."""
-    signs = {int(np.sign(press.z_counts)) for press in presses}
-    return signs.pop() if len(signs) == 1 else None
-
-
 _AGAIN: Final = "press again: run the doctor once more"
 _NORM: Final = "as the model expects: x right, y down, z up when pressed"
 
@@ -103,17 +94,15 @@ _NORM: Final = "as the model expects: x right, y down, z up when pressed"
 def judge_press(
     presses: Sequence[Press], geometry: SensorGeometry = USPA44, *, kept: bool = False
 ) -> tuple[list[Finding], Mounting | None]:
-    """Return the findings, and the mounting that they give; None while order or axes are not clear.
-
-    Where the results are `kept`, in a sensor file, nothing is left to be done.
-    """
+    """Return the findings, and the mounting that they give, None while unclear. What a file has `kept` is right."""
     if len(presses) < FEWEST_CORNERS:
         measured = f"{len(presses)} of 4 corners measured"
         return [Finding(name, "not known", measured, "", _AGAIN) for name in ("taxel order", "axis signs")], None
     verdict, remedy = "wrong", "write a sensor file, edge-sr doctor --out FILE, and run edge-sr --sensor FILE"
     if kept:
         verdict, remedy = "look", "the sensor file states this: run edge-sr with it"
-    turn, axes, z = find_order(presses, geometry), find_axes(presses, geometry), z_sign(presses)
+    turn, axes = find_order(presses, geometry), find_axes(presses, geometry)
+    z_signs = {int(np.sign(press.z_counts)) for press in presses}
     norm = "each corner answers where it is pressed"
     if turn is None:
         corners = ", ".join(f"{CORNERS[geometry.corners.index(press.place)]}: taxel {press.taxel}" for press in presses)
@@ -121,10 +110,10 @@ def judge_press(
         order = Finding("taxel order", "wrong", corners, norm, other)
     else:
         order = judged("taxel order", "ok" if turn == AS_MAPPED else verdict, turn, norm, remedy)
-    if axes is None or z is None:
-        return [order, _unclear_axes(sum(press.push_counts is not None for press in presses), z)], None
+    if axes is None or len(z_signs) > 1:
+        return [order, _unclear_axes(sum(press.push_counts is not None for press in presses), z_signs)], None
     swapped, signs_xy = axes
-    mounting = Mounting(swap_xy=swapped, signs=(*signs_xy, z), taxel_count=geometry.taxel_count)
+    mounting = Mounting(swap_xy=swapped, signs=(*signs_xy, z_signs.pop()), taxel_count=geometry.taxel_count)
     ways = [way for way, sign in zip("xyz", mounting.signs, strict=True) if sign < 0]
     parts = ["x and y swapped"] * mounting.swap_xy + [f"{', '.join(ways)} reversed"] * bool(ways)
     measured = " and ".join(parts) or "x right, y down, z up when pressed"
@@ -132,8 +121,8 @@ def judge_press(
     return [order, signs], None if turn is None else replace(mounting, order=orders(geometry)[turn])
 
 
-def _unclear_axes(pushes: int, z: int | None) -> Finding:
-    if z is None:
+def _unclear_axes(pushes: int, z_signs: Collection[int]) -> Finding:
+    if len(z_signs) > 1:
         remedy = "z must do the same under every press: the pad was still loaded, or a taxel is reversed; press again"
         return Finding("axis signs", "wrong", "z rises under some presses and falls under others", _NORM, remedy)
     if pushes < FEWEST_CORNERS:
@@ -151,7 +140,7 @@ class Weighed(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The interval itself."""
+        """Its 90 % interval."""
         return self.counts_per_newton * (1 - self.error), self.counts_per_newton * (1 + self.error)
 
     @property
@@ -172,9 +161,8 @@ HEAVIEST_G: Final = 4000  # 40 N, the deepest presses of the training
 LEAST_SHARE: Final = 0.25  # of the mean, on the taxel that reads least under a weight that covers the pad
 COVERED_ERROR: Final = 0.08
 PARTLY_ERROR: Final = 0.3
-"""By simulated discs of 2 N that lie as their weight lets them, on 8 pads of the whole range, in the middle and 1.5 mm
-off: those of 22 and 28 mm read 0.93 to 1.04 of the right counts, those of 19 mm that pass as covering up to 1.09, and
-those of 14 and 16 mm, which do not, 0.68 to 1.15."""
+"""By simulated discs of 2 N on 8 pads, in the middle and 1.5 mm off: those of 22 and 28 mm read 0.93 to 1.04 of the
+right counts, those of 19 mm that pass as covering up to 1.09, and of 14 and 16 mm, which do not, 0.68 to 1.15."""
 
 
 def judge_force(weighed: Weighed | None, *, kept: bool) -> Finding:
@@ -220,35 +208,21 @@ Dialogue = Generator[str | None, Reading, T]
 
 
 class GuidedPress:
-    """Dialogue that asks a person for four presses on corners, one after the other, then to lay a weight on the pad.
+    """Dialogue that asks a person for four presses on corners, one after the other, then to lay a weight on the pad."""
 
-    Attributes:
-        first: the first request.
-        done: True when there are no more requests.
-        presses: those that were felt.
-        weight_g: mass of the weight in [g]; None where there is none.
-        weighed: counts per newton of the summed z, where a weight was laid on; else None.
-    """
-
-    def __init__(self, geometry: SensorGeometry = USPA44, *, weigh: bool = False, z_noise_counts: float = 0.0) -> None:
-        """Prepare to ask, with `weigh` for a weight, too.
-
-        `z_noise_counts` is the standard deviation of the free pad's summed z, which it has under a still weight, too.
-        """
-        self.done = False
-        self.presses: list[Press] = []
-        self.weight_g: float | None = None
-        self.weighed: Weighed | None = None
+    def __init__(self, geometry: SensorGeometry = USPA44, *, weigh: bool = False) -> None:
+        """Prepare to ask, with `weigh` for a weight, too."""
+        self.done = False  # there are no more requests
+        self.presses: list[Press] = []  # those that were felt
+        self.weight_g: float | None = None  # mass of the weight; None where there is none
+        self.weighed: Weighed | None = None  # by the weight, if one was laid on
         self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
-        self._dialogue = self._all(geometry.corners, weigh, z_noise_counts)
+        self._dialogue = self._all(geometry.corners, weigh)
         self.first: Final = next(self._dialogue) or ""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
-        """Take one more reading (3, rows, cols) over the baseline, in counts; returns the next request, or None.
-
-        Where it is NaN the taxel's last reading stands.
-        """
-        self._held = np.where(np.isnan(zeroed), self._held, zeroed)
+        """Take one more reading (3, rows, cols) over the baseline, in counts; returns the next request, or None."""
+        self._held = np.where(np.isnan(zeroed), self._held, zeroed)  # of a torn scan the taxel's last reading stands
         return self._go_on(lambda: self._dialogue.send(Reading(self._held, time_s)))
 
     def type(self, line: str = "") -> str | None:
@@ -264,7 +238,7 @@ class GuidedPress:
             self.done = True
             return None
 
-    def _all(self, corners: Sequence[int], weigh: bool, z_noise_counts: float) -> Dialogue[None]:
+    def _all(self, corners: Sequence[int], weigh: bool) -> Dialogue[None]:
         for place, name in zip(corners, CORNERS, strict=True):
             try:
                 press = yield from _corner(place, name)
@@ -279,7 +253,7 @@ class GuidedPress:
         if weigh:
             self.weight_g = yield from _mass_g()
         if self.weight_g is not None:
-            self.weighed = yield from _weigh(self.weight_g, z_noise_counts)
+            self.weighed = yield from _weigh(self.weight_g)
 
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
@@ -332,21 +306,18 @@ def _number(text: str) -> float:
         return np.nan
 
 
-def _weigh(weight_g: float, z_noise_counts: float) -> Dialogue[Weighed | None]:
+def _weigh(weight_g: float) -> Dialogue[Weighed | None]:
     """Return what a weight shows; None where nothing steady was laid on."""
     steady: list[NDArray[np.float32]] = []  # of z
 
     def lies_still(reading: Reading) -> bool:
         steady.append(reading.zeroed[2])
         del steady[:-STEADY_SCANS]
-        sums = np.abs(np.sum(steady, axis=(1, 2)))
-        if len(sums) < STEADY_SCANS or sums.min() <= 100.0:
+        if len(steady) < STEADY_SCANS:
             return False
-        # Noise alone spreads 50 readings over 4.5 of its deviations, and the means of ten of them over 0.7; hardly ever
-        # over these limits.
-        allowed, means = max(30.0, 0.02 * sums.max()), sums.reshape(5, -1).mean(axis=1)
-        spread_by_noise = np.ptp(sums) < max(allowed, 7 * z_noise_counts)
-        return bool(spread_by_noise and np.ptp(means) < max(allowed, 1.5 * z_noise_counts))
+        # Means of ten scans: usual noise of 4 counts a taxel spreads them over 12.
+        sums = np.abs(np.sum(steady, axis=(1, 2))).reshape(-1, 10).mean(axis=1)
+        return bool(sums.min() > 100.0 and np.ptp(sums) < max(20.0, 0.02 * sums.max()))
 
     ask = f"Lay {weight_g:g} g on the pad, flat and covering all of it, hands off."
     laid = yield from _wait(ask, lies_still, 1)
@@ -373,19 +344,14 @@ def _wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[
         reading = yield None
 
 
-def _load_counts(zeroed: NDArray[np.float32]) -> float:
-    """Return the sum of the sizes of z, in either direction."""
-    return float(np.abs(zeroed[2]).sum())
-
-
 def _shear_counts(reading: Reading) -> NDArray[np.float32]:
     """Return the sums of x and of y."""
     return reading.zeroed[:2].sum(axis=(1, 2))
 
 
 def _touched(reading: Reading) -> bool:
-    return _load_counts(reading.zeroed) >= ON_COUNTS
+    return bool(np.abs(reading.zeroed[2]).sum() >= ON_COUNTS)
 
 
 def _free(reading: Reading) -> bool:
-    return _load_counts(reading.zeroed) < OFF_COUNTS
+    return bool(np.abs(reading.zeroed[2]).sum() < OFF_COUNTS)

@@ -38,10 +38,7 @@ class Watched:
 
 
 def check_id_map(watched: Watched, half_silent: bool) -> Finding | None:
-    """Check that the chosen id map fits the CAN ids that came; None where none are seen at all.
-
-    `half_silent` is true where half of the taxels or more of some sensor are silent.
-    """
+    """Check that the chosen id map fits the CAN ids that came; half a sensor may be silent. None if none came."""
     ids, model = watched.ids, watched.model
     if not ids:
         return None

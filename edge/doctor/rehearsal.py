@@ -33,21 +33,9 @@ class Rehearsal(Emulator):
 
     def answer(self, request: str) -> None:
         """Do what a request of the guided press asks of a person."""
-        load = np.zeros(USPA44.scan_shape)
-        corner = next((name for name in CORNERS if name in request), None)
-        if corner is not None:
-            row, col = (0.3 if side in corner else 2.7 for side in ("top", "left"))  # a little inside of it
-            load[2] = 5000 * _pressed(row, col)  # counts
-        elif request.startswith("Still pressing"):
-            z = self._next[2]
-            row, col = np.unravel_index(z.argmax(), z.shape)
-            load[:] = 0.2 * z * (1 if col < 2 else -1), 0.2 * z * (1 if row < 2 else -1), z
-        elif request.startswith("Lay"):
-            # By counts per newton of the average sensor.
-            load[2] = _WEIGHT_G / 1000 * 9.80665 * 1176 / USPA44.taxel_count
-        elif request.endswith(ASK_WEIGHT):
+        if request.endswith(ASK_WEIGHT):
             self._typed = f"{_WEIGHT_G:g}"
-        self._next_s, self._next = time.monotonic() + ANSWER_S, load
+        self._next_s, self._next = time.monotonic() + ANSWER_S, load_asked(request, self._next)
 
     def typed_line(self) -> str | None:
         """Return what is typed since the last call, or None."""
@@ -62,8 +50,20 @@ class Rehearsal(Emulator):
             yield np.rint(reading).astype(np.int32)
 
 
-def _pressed(row: float, col: float) -> NDArray[np.float64]:
-    """Return each taxel's share (4, 4) of a press at a place of the grid; a finger is wider than a taxel."""
-    rows, cols = np.indices((USPA44.rows, USPA44.cols))
-    press = np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / 1.5)
-    return press / press.sum()
+def load_asked(request: str, load: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return counts (3, 4, 4) of what a person does at a request, after bearing `load` on the pad before."""
+    corner = next((name for name in CORNERS if f"the {name} corner" in request), None)
+    asked, z = np.zeros_like(load), load[2]
+    if corner is not None:  # a finger is wider than a taxel, and its middle a little inside
+        row, col = (0.3 if side in corner else 2.7 for side in ("top", "left"))
+        rows, cols = np.indices(z.shape)
+        press = np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / 1.5)
+        asked[2] = 5000 * press / press.sum()
+    elif "push towards" in request:
+        row, col = np.unravel_index(z.argmax(), z.shape)
+        asked[:] = 0.2 * z * (1 if col < 2 else -1), 0.2 * z * (1 if row < 2 else -1), z
+    elif "Lay " in request:
+        asked[2] = _WEIGHT_G / 1000 * 9.80665 * 1176 / USPA44.taxel_count  # by counts per newton of the average sensor
+    elif "et go." not in request and "Take it off" not in request:
+        return load
+    return asked

@@ -66,12 +66,6 @@ class Samples:
             noise[:, taxel] = _noise_of(steps[both[:, taxel], :, taxel])
         return noise
 
-    def z_sum_noise_counts(self) -> float:
-        """Return the standard deviation of z summed over the living taxels, likewise."""
-        whole = self.fresh[:, self.living].all(axis=1)
-        steps = around_counts(np.diff(self.counts[:, 2, self.living], axis=0)).sum(axis=1)
-        return float(_noise_of(steps[whole[1:] & whole[:-1]]))
-
     def rest_counts(self) -> NDArray[np.float64]:
         """Return (3, taxels), the median reading; NaN where a taxel is not living."""
         return self._median(slice(None))

@@ -17,46 +17,29 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S, SENSOR_SILENT_NS
 
 FEWEST_INTERVALS: Final = 5  # fewest intervals that give a period
-LONGEST_BURST: Final = 500
-"""Scans of a burst: five seconds of a sensor at 100 Hz; a longer one is the sensor's own pace."""
-GAP_PERIODS: Final = 1.5
-"""Periods between two scans that make a gap; jitter, and the 16 ms for which some adapters hold scans, stay below at
-10 ms."""
-SETTLING_SCANS: Final = 5
-"""Scans at their pace after a gap before the missing ones are counted; the least late of them decides."""
+GAP_PERIODS: Final = 1.5  # between two scans; jitter, and adapters that hold scans for 16 ms, stay below at 10 ms
+SETTLING_SCANS: Final = 5  # at their pace after a gap, before the missing ones are counted by the least late of them
 FEWEST_TOGETHER: Final = 4  # fewest sensors that are read together a few times a period
 LONGEST_PERIOD_S: Final = 0.05  # period from which scans come too seldom to be read together, in [s]
 RESTLESS_NS: Final = NS_PER_S  # time after a contact, in [ns], during which every scan is still read at once
 
 
 class Cadence:
-    """Cadence of one sensor: its period, and what did not come, which shows as a gap.
-
-    The wire does not number scans: the number missing between two follows from the sensor's own period, and is only as
-    exact as that.
-
-    Attributes:
-        last: newest scan; None before the first.
-        missed: scans that did not arrive, as far as gaps show.
-        period_ns: time between scans, in [ns], the median of the newest intervals, which neither jitter nor a gap
-            moves; None as long as too few have arrived.
-        silent: it was reported as silent.
-        since_ns: time before which its silence does not count, in [ns]: its link was away.
-    """
+    """Cadence of one sensor: its period, and by that what did not come, since the wire does not number scans."""
 
     def __init__(self, rate_hz: float | None = None) -> None:
-        """Begin without a scan; `rate_hz` is the sensor's rate in [Hz], None if unknown."""
         self.last: Scan | None = None
-        self.missed = self.since_ns = 0
-        self.silent = False
+        self.missed = 0  # scans that did not arrive, as far as gaps show
+        self.silent = False  # it was reported
+        self.since_ns = 0  # before which its silence does not count, as its link was away
+        # Median of the newest intervals, which neither jitter nor a gap moves; None while too few have arrived.
         self.period_ns = self._stated_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
         self._intervals: deque[int] = deque(maxlen=31)
-        self._hurried = 0
         self._forget_pace(None)
 
     @property
     def rate_hz(self) -> float | None:
-        """Rate of the newest scans in [Hz]; None as long as too few have arrived."""
+        """Rate of the newest scans in [Hz]; None while too few have arrived."""
         return None if self.period_ns is None else NS_PER_S / self.period_ns
 
     def follow(self, scan: Scan) -> None:
@@ -67,17 +50,9 @@ class Cadence:
             return
         gap_ns = scan.on_bus_ns - before.on_bus_ns
         if gap_ns > 0 and (scan.device_ns is not None or not scan.unread_ns):  # those that waited came at no pace
-            # Held up somewhere, it came right behind the one before; unless all of late did. Bursts of all sixteen
-            # frames, 16 ms apart, are further apart.
-            hurried = self.period_ns is not None and gap_ns * 8 < self.period_ns
-            self._hurried = self._hurried + 1 if hurried else 0
-            if self._hurried > LONGEST_BURST:
-                self._intervals.clear()
-                self.period_ns = self._stated_ns
-            if not 0 < self._hurried <= LONGEST_BURST:
-                self._intervals.append(gap_ns)
-                if self._stated_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
-                    self.period_ns = sorted(self._intervals)[len(self._intervals) // 2]
+            self._intervals.append(gap_ns)
+            if self._stated_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
+                self.period_ns = sorted(self._intervals)[len(self._intervals) // 2]
         period_ns = self.period_ns
         # Half of the fastest sensor's: scans that are nearer waited somewhere.
         if period_ns and period_ns >= 500_000 and (self._before_gap is not None or gap_ns > GAP_PERIODS * period_ns):
@@ -106,15 +81,11 @@ class Cadence:
                 self._forget_pace(scan)
 
     def _mean_period_ns(self, scan: Scan, period_ns: int) -> float:
-        """Return the mean period over all scans since the last gap, if there were enough, else the median.
-
-        Over many the mean is more exact: with a median that is 1 % off, a stall of a second would seem to have
-        swallowed a scan.
-        """
+        """Return the mean period over all scans since the last gap, if there were enough, else the median."""
         first = self._paced_from or scan
         scans = scan.number - first.number
         mean_ns = (scan.on_bus_ns - first.on_bus_ns) / scans if scans else 0.0
-        return mean_ns if scans >= 32 else max(period_ns, mean_ns)
+        return mean_ns if scans >= 32 else max(period_ns, mean_ns)  # by a median 1 % off, a stall swallows a scan
 
 
 class ReadingPace(NamedTuple):
@@ -125,20 +96,13 @@ class ReadingPace(NamedTuple):
 
 
 class Cadences:
-    """Cadences of all sensors, those that fall silent while another goes on, and the pace at which to read them.
-
-    Attributes:
-        missed: scans of all sensors that did not arrive, as far as gaps show.
-        late: patterns that were ready later than one period after their scan.
-        patience_s: longest time for which results of sensors at rest may wait, in [s].
-        pace: chosen by the newest results.
-        waited_ns: a scan before it came late because of the pace, so that its pattern is no worse for being late.
-    """
+    """Cadences of all sensors, those that fall silent while another goes on, and the pace at which to read them."""
 
     def __init__(self, expected: Iterable[str] = (), *, recorded: bool = False, rate_hz: float | None = None) -> None:
         """Begin without a scan, with the sensors that should be there; a recording has no cable to check."""
-        self.missed = self.late = 0
-        self.patience_s = self.waited_ns = 0.0
+        self.missed = self.late = 0  # patterns are late that were ready more than one period after their scan
+        self.patience_s = 0.0  # longest time for which results of sensors at rest may wait
+        self.waited_ns = 0.0  # a scan before it came late because of the pace, so that its pattern is not late
         self.pace = ReadingPace()
         self._recorded, self._rate_hz = recorded, rate_hz
         self._expected = set(expected)
@@ -178,10 +142,7 @@ class Cadences:
         return Event(scan.time_ns, "back", scan.sensor, f"sensor {scan.sensor} is back after {away_s:.1f} s")
 
     def look(self) -> list[Event]:
-        """Return events of sensors newly silent while another is not, and choose the pace anew.
-
-        The link reports a silence of all of them.
-        """
+        """Return events of sensors silent while another is not, since a link reports its own; choose the pace anew."""
         rests = self._newest_ns - self._restless_ns > RESTLESS_NS
         if rests or self.pace.every_s or len(self._sensors) >= FEWEST_TOGETHER:
             self._choose_pace(rests=rests)
@@ -194,16 +155,16 @@ class Cadences:
             if last is None or cadence.silent or now_ns - max(last.time_ns, cadence.since_ns) <= SENSOR_SILENT_NS:
                 continue
             cadence.silent = True
-            events.append(self._silence(sensor, last.time_ns, "the recording has none in that time"))
+            events.append(self._silence(sensor, last.time_ns))
         if self._expected and now_ns - self._first_ns > SENSOR_SILENT_NS:
             missing, self._expected = sorted(self._expected), set()
             self._absent.update(missing)
-            why = "the recording has none of it, though there is a baseline or a force for it"
-            events += [self._silence(sensor, self._first_ns, why) for sensor in missing]
+            events += [self._silence(sensor, self._first_ns) for sensor in missing]
         return events
 
-    def _silence(self, sensor: str, since_ns: int, why_recorded: str) -> Event:
-        why = why_recorded if self._recorded else "check its cable and its controller, since other sensors continue"
+    def _silence(self, sensor: str, since_ns: int) -> Event:
+        why = "check its cable and its controller, since other sensors continue"
+        why = "the recording has none" if self._recorded else why
         silent_s = (self._newest_ns - since_ns) / NS_PER_S
         return Event(self._newest_ns, "silent", sensor, f"no scan from sensor {sensor} for {silent_s:.1f} s: {why}")
 

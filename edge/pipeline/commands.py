@@ -1,13 +1,12 @@
-"""Commands to a run in one queue, and poses in another: from keys, signals, viewers and JSON lines on stdin.
-
-A line is such as {"cmd": "reset"}, or {"cmd": "pose", "x_mm": 1.5, "y_mm": 0}.
-"""
+"""Commands to a run in one queue, and poses in another: from keys, signals, viewers and JSON lines on stdin."""
 
 import os
 import select
 import sys
+import termios
 import threading
 import time
+import tty
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -28,17 +27,11 @@ WAITING: Final = 64  # commands that may wait until the loop takes them
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Request of a user that is carried out between two scans.
+    """Request of a user that is carried out between two scans."""
 
-    Attributes:
-        name: "reset" forgets earlier taps, "zero" zeroes again.
-        sensor: name of the sensor to zero; None for all.
-        force: zero it even if it is in contact.
-    """
-
-    name: Literal["reset", "zero"]
-    sensor: str | None = None
-    force: bool = False
+    name: Literal["reset", "zero"]  # "reset" forgets earlier taps
+    sensor: str | None = None  # to zero; None for all
+    force: bool = False  # zero it even if it is in contact
 
     def __post_init__(self) -> None:
         # Any other name would zero: unlike a reset, a zeroing cannot be undone.
@@ -62,19 +55,12 @@ ZERO: Final = Command("zero")
 
 
 class Commands:
-    """Queue of users' commands; any thread puts, and the loop takes between two scans.
-
-    Attributes:
-        refused: messages that were no command, or came when too many waited.
-        reason: why the first of them since the reason was taken was refused; None without.
-        poses: poses of pads, which wait in a queue of their own: a stream of them must not hold up a command.
-    """
+    """Queue of users' commands; any thread puts, and the loop takes between two scans."""
 
     def __init__(self) -> None:
-        """Start empty, without a producer."""
-        self.refused = 0
-        self.reason: str | None = None
-        self.poses = PoseQueue()
+        self.refused = 0  # messages that were no command, or came when too many waited
+        self.reason: str | None = None  # why the first of them was refused since the reason was taken
+        self.poses = PoseQueue()  # a queue of its own: a stream of poses must not hold up a command
         self._lock = threading.Lock()
         self._waiting: SimpleQueue[Command] = SimpleQueue()
         self._producers: list[Callable[[], object]] = []
@@ -111,10 +97,7 @@ class Commands:
 
 @contextmanager
 def command_lines(commands: Commands, descriptor: int) -> Iterator[None]:
-    """Take lines of a file descriptor as commands within a with statement, in a thread, as soon as they come.
-
-    A pose without a time has that of its arrival, and the loop may be waiting for a scan. The descriptor stays open.
-    """
+    """Take lines of a file descriptor, which stays open, as commands within a with statement."""
     woken, waking = os.pipe()
 
     def follow() -> None:
@@ -129,6 +112,7 @@ def command_lines(commands: Commands, descriptor: int) -> Iterator[None]:
                 for line in lines:
                     _take_line(commands, line)
 
+    # A pose without a time has that of its arrival, and the loop may be waiting for a scan.
     thread = threading.Thread(target=follow, name="command-lines", daemon=True)
     thread.start()
     try:
@@ -169,12 +153,9 @@ def runtime_command(parsed: Mapping[str, Any]) -> Command | None:
 
 @contextmanager
 def read_stdin(commands: Commands) -> Iterator[None]:
-    """Take lines of stdin as commands, unless there is no stdin or it is a terminal, which has keys.
-
-    Only on POSIX can a pipe be polled for data.
-    """
+    """Take lines of stdin as commands, unless there is no stdin or it is a terminal, which has keys."""
     with ExitStack() as reading:
-        if os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and not sys.stdin.isatty():
+        if sys.stdin is not None and not sys.stdin.closed and not sys.stdin.isatty():
             with suppress(OSError):  # a replaced stdin is not a file of the system
                 reading.enter_context(command_lines(commands, sys.stdin.fileno()))
         yield
@@ -190,12 +171,9 @@ def terminal_keys(commands: Commands) -> Iterator[None]:
     A shell restores the terminal itself after a program that a signal has ended or stopped, and gives it back without a
     signal: each look sets it for keys again where it is set for lines.
     """
-    if os.name != "posix" or sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
+    if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
         yield
         return
-    import termios
-    import tty
-
     descriptor = sys.stdin.fileno()
 
     def take_keys() -> None:

@@ -40,16 +40,12 @@ class GainKeeper:
 def keep_learned(
     path: Path, sensor: str, learned: Pad, mounting: Mounting | None = None, *, emulated: bool = False
 ) -> None:
-    """Write gains, learned with a mounting, into a sensor file, unless it holds surer ones.
+    """Write gains, learned with a mounting, into a sensor file, unless it holds surer ones; raises SensorFileError.
 
-    The file is read again first, since a person or the doctor may have changed it meanwhile.
-
-    Raises:
-        SensorFileError: the file cannot be read or written, or states another mounting now, by which each gain would be
-            another taxel's, or another axis's.
+    A file that states another mounting now is refused: by it each gain would be another taxel's, or another axis's.
     """
     with changing(path):
-        file = load_sensor_file(path)
+        file = load_sensor_file(path)  # again, since a person or the doctor may have changed it meanwhile
         entry = file.sensors.get(sensor, SensorEntry(assumed=frozenset({"mounting"})))
         if mounting not in (None, entry.mounting):
             raise SensorFileError(f"{path}: the mounting of sensor {sensor} was changed after they were learned")
@@ -62,11 +58,7 @@ def keep_learned(
 
 
 def forget_learned(path: Path, sensor: str) -> None:
-    """Remove the learned gains of a sensor from a sensor file.
-
-    Raises:
-        SensorFileError: the file has none, or cannot be read or written.
-    """
+    """Remove the learned gains of a sensor from a sensor file, or raise a SensorFileError if it has none."""
     with changing(path):
         file = load_sensor_file(path)
         entry = file.sensors.get(sensor)

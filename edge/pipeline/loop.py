@@ -31,13 +31,7 @@ ALL_HEARD_SCANS: Final = 10  # scans of one sensor of a link after which all sen
 
 
 class Loop:
-    """Maker of results from the scans, commands and poses of a source, in the thread that asks for a step.
-
-    Sinks get each result and event as soon as it is made.
-
-    Attributes:
-        statistics: of the results so far.
-    """
+    """Maker of results from the scans, commands and poses of a source, in the thread that asks for a step."""
 
     def __init__(
         self,
@@ -52,23 +46,12 @@ class Loop:
         statistics: Statistics | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Prepare to make results.
+        """Prepare to make results of an open source, by the settings below; raises UsageError if it has a stream.
 
-        Args:
-            source: open.
-            runtime: makes the results.
-            sinks: open; they get every result and event, and the poses, before anything else does. Their counters are
-                the stream's.
-            on_event: called with each event, in its place between results.
-            stop: ends the stream after the scans that wait.
-            duration_s: longest time to run, from the first step on, in [s]; for a recording that is read as fast as
-                results are made, measured in the time of the recording.
-            commands: polled between scans.
-            statistics: filled on the way, so that they are available however the stream ends.
-            clock_ns: clock of the scans, in [ns].
-
-        Raises:
-            UsageError: the duration is out of range, or the source has another stream.
+        Sinks get every result and event, and the poses, before anything else does; `on_event` is called with each
+        event, in its place between results. `stop` ends the stream after the scans that wait, `duration_s` [s] after
+        the first step; of a recording that is read as fast as results are made, it is of the recording's time.
+        Commands are polled between scans, and statistics filled on the way, so that they are there however it ends.
         """
         check_kind("source", source, "patient", "an open one: with open_source(...) as source")
         check_kind("runtime", runtime, "unposed", "what open_runtime returned")
@@ -139,10 +122,7 @@ class Loop:
                 self._on_event(made)
 
     def _step(self, wait_s: float) -> None:
-        """Make the results of all that waits, after waiting at most `wait_s` [s]; of a patient source, of every scan.
-
-        Where the source is lost, or a sink or the model fails, the error waits until the results before it are taken.
-        """
+        """Make the results of what waits after at most `wait_s` [s], then raise errors; a patient source gives one."""
         with self._turn:
             if self._error is not None:
                 raise self._error.with_traceback(None)  # else every call would lengthen it
@@ -206,10 +186,7 @@ class Loop:
             self.statistics.sink_trouble = "; ".join(troubles) or None
 
     def _no_sensor(self, name: str) -> str | None:
-        """Return why no sensor has this name; None if one has, or if one that has it may still come.
-
-        The sensors of a link send their scans in turn: once one has sent many, all have sent some.
-        """
+        """Return why no sensor has this name; None if one has, or if one that has it may still come."""
         heard = self.statistics.scans_of_each()
         if not isinstance(name, str):
             return f"no sensor {name!r}: a name is text, such as '4'"

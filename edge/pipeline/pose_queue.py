@@ -15,13 +15,10 @@ from firmware_bridge.poses import AHEAD_NS, PLACE_ERROR_MM, TURN_ERROR_DEG, PadP
 from firmware_bridge.scans.scan import is_sensor_name
 from firmware_bridge.schedule import SENSOR_SILENT_NS
 
-FURTHEST_AHEAD_NS: Final = 1_000_000_000
-"""Longest time that a pose may lie ahead of now, in [ns]: all others until then would come too late."""
+FURTHEST_AHEAD_NS: Final = 1_000_000_000  # of now that a pose may lie: all others until then would come too late
 LONGEST_BYTES: Final = 4096  # bytes of one message: ten times those of a pose
-WAITING_POSES: Final = 1024
-"""Poses that may wait, a second at 1000 poses/s: four times as long as the loop ever waits for a scan."""
-REPEATED_NS: Final = 10_000_000_000
-"""Time after which the same reason is reported again, in [ns]: a stream of bad poses must not flood."""
+WAITING_POSES: Final = 1024  # a second at 1000 poses/s: four times as long as the loop ever waits for a scan
+REPEATED_NS: Final = 10_000_000_000  # until the same reason is reported again: a stream of bad poses must not flood
 
 
 def json_object(message: str | bytes) -> dict[str, Any] | None:
@@ -42,11 +39,7 @@ class PoseError(ValueError):
 
 
 def pose_of_fields(fields: Mapping[str, Any], now_ns: int) -> TimedPose:
-    """Return the pose in parsed JSON such as {"cmd": "pose", "x_mm": 1.5, "y_mm": 0}, of its arrival if it has no time.
-
-    Raises:
-        PoseError: a field is missing, unknown, of another kind or out of range.
-    """
+    """Return the pose in parsed JSON, of its arrival without a time, or raise a PoseError where a field is wrong."""
     errors = {"error_mm": PLACE_ERROR_MM, "error_deg": TURN_ERROR_DEG}
     numbers = {"x_mm": None, "y_mm": None, "turn_deg": 0.0} | errors
     defaults = {"cmd": "pose", **numbers, "sensor": None, "time_ns": now_ns, "holds": False}
@@ -90,17 +83,12 @@ def _shown(value: object) -> str:
 
 
 class PoseQueue:
-    """Queue of poses from all sources of them, bounded; and of the reasons for which others are refused.
-
-    Attributes:
-        refused: poses that could not be taken.
-        dropped: poses that waited too long, behind too many others.
-        begun: True once there was a pose, or a reason to report; most runs have none, and follow none.
-    """
+    """Queue of poses from all sources of them, bounded; and of the reasons for which others are refused."""
 
     def __init__(self) -> None:
-        self.begun = False
-        self.refused = self.dropped = 0
+        self.begun = False  # True once there was a pose, or a reason to report; most runs have none, and follow none
+        self.refused = 0  # poses that could not be taken
+        self.dropped = 0  # poses that waited too long, behind too many others
         self._lock = threading.Lock()
         self._waiting: deque[TimedPose] = deque()
         self._reasons: dict[str, str] = {}
@@ -156,20 +144,13 @@ class _Course:
 
 
 class PoseIntake:
-    """Intake of poses, in the thread of the loop, between two scans.
-
-    Attributes:
-        used: poses that the runtime has taken.
-    """
+    """Intake of poses, in the thread of the loop, between two scans."""
 
     def __init__(
         self, runtime: Runtime, queue: PoseQueue, *, refused: str | None = None, unused_by: str | None = None
     ) -> None:
-        """Begin without a pose; `refused` is why none but those of the source are taken.
-
-        `unused_by` names the model where neither it nor any sink uses poses.
-        """
-        self.used = 0
+        """Begin without a pose; `refused` is why others than the source's are, `unused_by` a model that uses none."""
+        self.used = 0  # poses that the runtime has taken
         self._runtime, self._queue = runtime, queue
         self._refused, self._unused_by = refused, unused_by
         self._courses: dict[str | None, _Course] = {}
@@ -185,8 +166,7 @@ class PoseIntake:
     ) -> list[TimedPose]:
         """Pass on the poses that wait and those of the source, and return those that the runtime has taken.
 
-        They hold from the first scan after them, or else from now, the time of a recording's newest scan. `no_sensor`
-        returns why no sensor has a name.
+        They hold from the first scan after them, or from now where none has come.
         """
         waiting = self._queue.take()
         if self._refused is not None:

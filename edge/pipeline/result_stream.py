@@ -25,42 +25,25 @@ from firmware_bridge.schedule import NS_PER_S, POLL_S
 
 @dataclass(frozen=True, slots=True)
 class Latest:
-    """Newest result of a sensor, with all that decides whether it still holds.
+    """Newest result of a sensor, with all that decides whether it still holds."""
 
-    Attributes:
-        result: None before the first.
-        age_s: time since its reading was taken, at most, in [s]; it grows until the next scan arrives, and is infinite
-            before the first result.
-        link: "up"; "silent", no scan arrives; "lost", the adapter is gone; "ended", no more will come.
-        new: False if an earlier call, or an iteration, returned this result.
-        skipped: results of the sensor that nothing returned, since the last one that was.
-    """
-
-    result: Result | None
-    age_s: float
-    link: LinkState
-    new: bool
-    skipped: int
+    result: Result | None  # None before the first
+    age_s: float  # time since its reading was taken, at most; it grows until the next scan, and is at first infinite
+    link: LinkState  # "silent", no scan arrives; "lost", the adapter is gone; "ended", no more will come
+    new: bool  # False if an earlier call, or an iteration, returned this result
+    skipped: int  # results of the sensor that nothing returned, since the last one that was
 
 
 class Stream(Loop):
     """Results of a source, one for every scan, until it ends, `stop` is set or `duration_s` is over.
 
-    A loop over it gets every result in order; `latest` and `read` return the newest, and leave out those before it.
-    Of the scans that wait, the newest of each sensor gets a pattern; the older ones get their result without one.
-    Patterns of up to four sensors are made in one call, those of more in several, the sensor that has waited
-    longest first. Results of one sensor stay in the order of its scans.
-    A result is made in the thread that asks for it: between two calls the runtime may be asked to zero or to reset.
-    Any thread may state poses. A sensor that has a baseline or counts per newton, and of which no scan arrives, is
-    reported as an event. A loop that was left may be continued by another, from the next result on. Closing the source
-    closes its streams.
+    A loop over it gets every result in order, and may be left and continued; `latest` and `read` return the newest, and
+    leave out those before it. Of the scans that wait, the newest of each sensor gets a pattern. A result is made in the
+    thread that asks for it: between two calls the runtime may be asked to zero or to reset. A sensor that has a
+    baseline or counts per newton, and of which no scan arrives, is reported as an event.
     """
 
     _worker: ThreadPoolExecutor | None = None
-
-    def __repr__(self) -> str:
-        statistics = self.statistics
-        return f"<Stream of {self._source.name}: {statistics.scans} scans, {statistics.patterns} patterns>"
 
     def pose(
         self,
@@ -74,20 +57,12 @@ class Stream(Loop):
         sensor: str | None = None,
         holds: bool = False,
     ) -> None:
-        """State where the pad of a sensor is; any thread may call it, and it applies from the next scans on.
+        """State where the middle of a sensor's pad is, and its turn from x to y, in the object's plane.
 
-        Args:
-            x_mm: place of the pad's middle in the object's plane, along x, in [mm].
-            y_mm: along y.
-            turn_deg: turn of the pad from x to y, in [deg].
-            error_mm: standard deviation of the place along x and along y, in [mm].
-            error_deg: standard deviation of the turn, in [deg].
-            time_ns: when it was there, by `time.monotonic_ns`, later than the pose before; None for now.
-            sensor: name of the sensor; None for every sensor without poses of its own.
-            holds: the pad rests there until the next pose. Without it poses must come several times a second.
-
-        Raises:
-            UsageError: a value is out of range, or the source is a recording, whose scans are not of now.
+        Any thread may call it, and it applies from the next scans on. Errors are standard deviations. The pad was there
+        at `time_ns`, by `time.monotonic_ns`, later than the pose before; None stands for now. Without a sensor it is of
+        all that have no poses of their own. A pad that `holds` rests there until the next pose; else poses must come
+        several times a second. Raises UsageError for a value out of range, and for a recording.
         """
         if self._source.patient:
             raise UsageError(
@@ -103,13 +78,7 @@ class Stream(Loop):
             raise UsageError(f"a pose: {error}") from error
 
     def __iter__(self) -> Iterator[Result]:
-        """Yield every result from the next one on; those of scans that waited together come once all are made.
-
-        Raises:
-            LinkLostError: after every scan before it got its result.
-            ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
-            SinkError: a sink cannot be written; SinkClosedError if its reader has gone.
-        """
+        """Yield every result from the next one on; then raise what ended it: LinkLostError, ModelError, SinkError."""
         while True:
             yield from self._returned()
             if self._ended and self._error is None:
@@ -126,18 +95,11 @@ class Stream(Loop):
             await self._step_beside(POLL_S)
 
     def latest(self, sensor: str | None = None) -> Latest:
-        """Return the newest result of a sensor, with its age and the state of its link; never waits for a scan.
+        """Return the newest result of a sensor, such as "left/4", or of the only one; never waits for a scan.
 
-        It makes the results of the scans that have arrived since the last call. Results before the newest are skipped,
-        and counted; sinks get them all.
-
-        Args:
-            sensor: name of the sensor, such as "4" or "left/4"; None for the only one.
-
-        Raises:
-            UsageError: no sensor has this name; or none is named, and there are several; or the source is a recording
-                that is not paced.
-            LinkLostError: and other errors, as `__iter__` does, now and at every later call.
+        Results before the newest are skipped, and counted; sinks get them all. Raises UsageError where no sensor has
+        this name, or none is named and there are several, or the source is a recording that is not paced; and the
+        errors of `__iter__`, now and at every later call.
         """
         self._step_live(0.0)
         self.check_sensor(sensor)
@@ -149,16 +111,7 @@ class Stream(Loop):
         return {name: self._take_newest(name) for name in tuple(self._newest)}
 
     def read(self, sensor: str | None = None, *, timeout_s: float = 1.0) -> Latest:
-        """Return the newest result of a sensor, after waiting for one that no earlier call returned.
-
-        Args:
-            sensor: as in `latest`.
-            timeout_s: longest wait, in [s].
-
-        Raises:
-            NoResultError: none came in time, or no more will come.
-            UsageError: and other errors, as `latest` does.
-        """
+        """Return the newest result as `latest`, once there is a new one, or raise NoResultError after `timeout_s`."""
         for wait_s in self._waits_s(sensor, timeout_s):
             self._step_live(wait_s)
         return self._take_newest(sensor)
@@ -170,13 +123,7 @@ class Stream(Loop):
         return self._take_newest(sensor)
 
     def check_sensor(self, sensor: str | None) -> None:
-        """Refuse the name of a sensor that does not exist.
-
-        Before the sensors of its link have sent some scans, any name is accepted that one of them may have.
-
-        Raises:
-            UsageError: no sensor has this name; the message lists those that there are.
-        """
+        """Raise a UsageError where no sensor has this name, nor may have it until its link has sent some scans."""
         why = None if sensor is None else self._no_sensor(sensor)
         if why is not None:
             raise UsageError(why)
@@ -270,11 +217,10 @@ class Together(tuple[Result, ...]):
 
     @property
     def imbalance(self) -> float | None:
-        """Difference of force between the first of two pads and the second, over the mean of both.
+        """Difference of force between the first of two pads and the second, over the mean of both; None unless touched.
 
         A grip presses both alike: on a real one it was 0.04 to 0.09 with nominal newtons. Beyond 0.1 a pad has lost its
-        zero or its scale, or something else bears on what is gripped. None unless both pads are touched and their
-        baselines not in doubt.
+        zero or its scale, or something else bears on what is gripped.
         """
         if len(self) != 2 or not all(result.contact for result in self):
             return None
@@ -287,14 +233,10 @@ class Together(tuple[Result, ...]):
 def paired(results: Iterable[Result], sensors: Sequence[str], *, apart_s: float = 0.02) -> Iterator[Together]:
     """Yield the results of several sensors that belong together in time: one of each, in the order of their names.
 
-    Times are those of the scans on the bus, where the device states them. Each result is used once at most; of two that
-    could follow, the nearer one is taken, which is known a period later. Results without a partner are left out. Those
-    of one sensor may come long before those of another, as they do from a loop that was held up. `apart_s` is the
-    longest time from the first to the last result of a pair, in [s]: two periods of a sensor at 100 Hz.
-
-    Raises:
-        UsageError: fewer than two sensors, one twice, or the time is out of range; while pairs are taken, no sensor
-            has one of these names.
+    Times are those on the bus, where the device states them, from the first to the last at most `apart_s`: two periods
+    at 100 Hz. Each result is used once at most; of two that could follow, the nearer one is taken, which is known a
+    period later. Results without a partner are left out. Raises UsageError for names that are fewer than two, or that
+    no sensor has.
     """
     check_positive("apart_s", apart_s)
     if isinstance(sensors, str) or len(sensors) < 2 or len(set(sensors)) < len(sensors):
@@ -345,11 +287,7 @@ def _matches(waiting: dict[str, deque[Result]], apart_ns: int, newest_ns: int | 
 
 @contextmanager
 def uncollected() -> Generator[None, None, None]:
-    """Disable garbage collection within a with statement.
-
-    A full collection stops everything for tens of milliseconds, several periods of a sensor, and the loop makes no
-    cycles that would need one: its objects are freed at once. Older objects are kept out of later collections.
-    """
+    """Disable garbage collection, which stops everything for several periods of a sensor; the loop makes no cycles."""
     enabled = gc.isenabled()
     gc.collect()
     gc.freeze()
@@ -363,10 +301,7 @@ def uncollected() -> Generator[None, None, None]:
 
 
 def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: Statistics, **settings: Any) -> None:
-    """Run a stream into its sinks until it ends, without pauses for garbage collection; it takes the same settings.
-
-    Statistics are filled on the way, so that they are available however the run ends; errors are those of the stream.
-    """
+    """Run a stream into its sinks until it ends, without pauses for garbage collection; it takes the same settings."""
     stream = Stream(source, runtime, sinks=sinks, statistics=statistics, **settings)
     with uncollected():
         stream.run()

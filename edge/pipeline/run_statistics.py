@@ -1,6 +1,6 @@
 """Statistics of a run, in memory that does not grow with it; and advice to a person whose source gives no scan."""
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -166,34 +166,24 @@ class Statistics:
         return lines
 
 
-_UNREAD: Final = {
-    "without_readings": "they name no sensor: is one plugged in, and in the server's xServ.ini?",
-    "welcomes": "the server only greets: is a sensor plugged in, and in its xServ.ini?",
-    "bad_sensor": "the counts of their sensors are not those of a pad",
-    "bad_json": "they are no JSON with a number: another server answers at this address",
+_ADVICE: Final = {
+    "without_readings": "messages of the server name no sensor: is one plugged in, and in the server's xServ.ini?",
+    "bad_sensor": "messages of the server have other counts of taxels than a pad",
+    "bad_json": "messages are no JSON with a number: another server answers at this address",
+    "frames": "frames are lost, or this is another kind of pad (--id-map)?",
+    "error_frames": "is the bus at 1 Mbit/s?",
+    "skipped_bytes": "another device, or another line speed (@BAUD after the port)? See edge-sr devices, and",
 }
-"""Why messages of a server give no reading, by their counters, which the doctor does not show."""
+"""What may be wrong, by the counter of what came; the doctor does not show those of a server."""
 
 
 def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int]]) -> str:
     """Return what came of the sources, as the user named them, what may be wrong, and what to do."""
     source = f" --source {as_typed(sources[0])}" if len(sources) == 1 else ""
-    doctor = f"edge-sr doctor{source} shows what is wrong"
-    arrived = Counter(counters())
-    received = arrived["received_bytes"]
-    if arrived["messages"]:
-        why = max(_UNREAD, key=arrived.__getitem__)
-        lack = f": {_UNREAD[why]}" if arrived[why] else f"; {doctor}"
-        return f"{arrived['messages']} messages came from the server, and no whole scan in them{lack}"
-    if arrived["frames"]:
-        lack = "no whole scan in them: frames are lost, or this is another kind of pad (--id-map)"
-        return f"{arrived['frames']} CAN frames came, and {lack}; {doctor}"
-    if errors := arrived["error_frames"] + arrived["fd_frames"]:
-        return f"{errors} error frames or frames of CAN FD came, and no reading: is the bus at 1 Mbit/s? {doctor}"
-    if arrived["skipped_bytes"] > MOST_STRAY_BYTES:
-        return (
-            f"{received} bytes came, and no CAN frame in them: another device, or another line speed (@BAUD after the "
-            f"port)? edge-sr devices lists what is plugged in, and {doctor}"
-        )
-    came = f"{received} bytes came, the adapter's answers alone" if received else "nothing came"
-    return f"{came}: is the sensor powered and its cable in? {doctor}"
+    counted = counters()
+    arrived = {name: counted[name] for name in ("received_bytes", "messages", *_ADVICE) if counted.get(name)}
+    came = ", ".join(f"{name} {count}" for name, count in arrived.items())
+    if arrived.get("skipped_bytes", 0) <= MOST_STRAY_BYTES:
+        arrived.pop("skipped_bytes", None)
+    why = next((text for name, text in _ADVICE.items() if name in arrived), "is the sensor powered and its cable in?")
+    return f"{f'only {came}' if came else 'nothing'} came: {why} edge-sr doctor{source} shows what is wrong"

@@ -1,5 +1,7 @@
-"""Models and runtimes by name, with the settings of a source; and results of scans that a program has in an array."""
+"""Models, recordings and runtimes with the settings of a source; and results of scans that are in an array."""
 
+import math
+import threading
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +20,12 @@ from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import load_estimator
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped
+from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped, with_recorded
 from edge.validation import check_kind, check_positive
+from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44, pad_of
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track, check_raw
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.sensor_file.model import SensorEntry
@@ -32,11 +36,7 @@ if TYPE_CHECKING:
 
 
 def load_model(model: str | Path) -> "ModelSession":
-    """Load a model, a file or a bundled one by its name, and its contract; mtsr2 to mtsr7 take as many taps at most.
-
-    Raises:
-        ModelError: the model does not exist or cannot be used; the message names the bundled ones or the fault.
-    """
+    """Load a model, a file or a bundled one by its name, or raise a ModelError."""
     from edge.inference.onnx_session import ModelSession
 
     return ModelSession(find_model(model), taps=taps_of(model))
@@ -51,26 +51,12 @@ def open_runtime(
     pad: Pad | Mapping[str, Pad] | None = None,
     **options: Any,
 ) -> Runtime:
-    """Return a runtime that makes results of a source's scans; its defaults are those of `edge-sr`.
+    """Return a runtime that makes results of an open source's scans, by a model of `load_model`, its name or file.
 
-    Args:
-        model: name of a bundled one, a file, or a model that `load_model` returned.
-        source: open source of the scans.
-        baselines: stored ones, or their file; they take precedence over those of the source's sensor file. A sensor
-            without one is zeroed from its first 100 scans, during which its pad must be still and free.
-        counts_per_newton: summed z per [N], of all sensors or by name; by default as in the sensor file. A name from
-            which no scan arrives is reported as an event.
-        pad: properties of the pad of all sensors, or of each by name, for models that use them; by default as in the
-            sensor file.
-        options: those of `RuntimeOptions`, such as `every_scan=True`. With `learn` a `Stream` keeps the gains that it
-            learns in the source's sensor file; with `taps` and without poses taps follow the paper's schedule, each
-            turned by 5 degrees from the one before.
-
-    Raises:
-        ModelError: the model does not exist, cannot be used, or is for another sensor.
-        RecordingError: the baseline file cannot be used, or its taxel order is not that of the sensor file.
-        UsageError: the source is not open; a baseline is of another grid; a number is out of range; `taps` is more than
-            the model takes.
+    Baselines, or their file, summed z counts per newton, and the pads are of all sensors or of each by name, and
+    override those of the source's sensor file. A sensor without a baseline is zeroed from its first 100 scans, during
+    which its pad must be still and free. Options are those of `RuntimeOptions`, with the defaults of `edge-sr`. Raises
+    ModelError, RecordingError for the baseline file, or UsageError.
     """
     chosen = RuntimeOptions(**options)
     if not isinstance(model, (str, Path)):
@@ -95,23 +81,61 @@ def open_runtime(
     )
 
 
+def open_recording(
+    path: str | Path,
+    *more: str | Path,
+    sensor: str | Path | None = None,
+    zero: bool = False,
+    paced: bool = False,
+    rate_hz: float | None = None,
+    begins: threading.Event | None = None,
+) -> Source:
+    """Open a recording, .mcap, .npz or .csv, as a source, to compute its results again as `edge-sr replay` does.
+
+    Every scan gets a result, however slow the loop is, with the time, mounting and baseline of the recording. Those of
+    other sensors may be played beside it. A `sensor` file of the doctor takes the place of the recorded settings.
+    `zero` takes the baselines from the first 100 scans instead. With `paced` it is played at the recorded speed, from
+    when `begins` is set, as if live: a loop that is too slow loses scans. `rate_hz` is the scans a second of each
+    sensor, where the file does not state it, or to play it at another speed. Raises RecordingError, SourceError for
+    the rate, or SensorFileError.
+    """
+    from edge.pipeline.baseline_capture import free_baselines
+    from firmware_bridge.links.replay import ReplayLink
+
+    paths = [path for file in (path, *more) for path in recording_paths(str(file))]
+    replay = ReplayLink(paths, rate_hz, paced=paced, begins=begins)
+    tracks = [track for recording in replay.recordings for track in recording.tracks]
+    # A sensor file names the pad; without one the recording's grid does.
+    file = sensor_settings(sensor, unmapped(tracks[0].geometry) if sensor is None else None)
+    stored = with_recorded(file, [replay])
+    baselines: dict[str, Baseline] = {}
+    for recording in () if zero else replay.recordings:
+        # By the clock of an undated recording, they would be half a century old in a run of today.
+        undated = {"created_unix_s": math.nan} if paced and not recording.unix_offset_ns else {}
+        baselines |= {name: replace(baseline, **undated) for name, baseline in recording.baselines.items()}
+    if not zero:
+        baselines = baselines or stored.baselines
+        baselines |= free_baselines(replay, stored.mountings, baselines, rate_hz=rate_hz)
+    sensors = {*stored.sensors, *baselines}
+    if sensor is None:  # else a note reports the sensors that the file lacks
+        sensors |= {track.sensor for track in tracks}
+    as_wired = SensorEntry(Mounting(taxel_count=file.geometry.taxel_count))
+    entries = {
+        name: replace(stored.sensors.get(name, as_wired), baseline=baselines.get(name)) for name in sorted(sensors)
+    }
+    place_recordings(replay, file.mountings)
+    return Source(replay, sensor_file=replace(stored, sensors=entries), rate_hz=rate_hz)
+
+
 def infer(
     model: str | Path | Model, counts: ArrayLike, baseline: ArrayLike | Baseline, *, rate_hz: float = 100.0
 ) -> list[Result]:
     """Return a result for each scan of an array, as `edge-sr` makes it of the same scans of a sensor.
 
-    Args:
-        model: as in `open_runtime`; load it once with `load_model` if there are many arrays.
-        counts: (n, 3, rows, cols) raw counts in the order of their times, or one scan (3, rows, cols); or (n, 48) or
-            (n, 16, 3) as the vendor orders those of a uSPa44: x, y, z of taxel 1, of taxel 2, ... Whole numbers of any
-            type; -1 where a taxel gave no reading.
-        baseline: counts of the free pad in one of these shapes, whose median is taken, or their mean; or a Baseline.
-        rate_hz: scans a second, in [Hz].
-
-    Raises:
-        UsageError: counts are not whole; an array is of another shape, or out of range; the rate is.
-        ModelError: as in `open_runtime`.
-        RecordingError: counts are readings over a baseline, cut off at 0, or absent on some axes of a taxel.
+    Counts are raw and whole, (n, 3, rows, cols) or (3, rows, cols), or (n, 48) or (n, 16, 3) as the vendor orders those
+    of a uSPa44: x, y, z of taxel 1, of taxel 2, ...; -1 where a taxel gave no reading. The baseline is a Baseline, or
+    counts of the free pad in one of these shapes, of which the median is taken. Raises UsageError for other arrays,
+    RecordingError for counts over a baseline, and ModelError.
     """
     from firmware_bridge.links.replay import ReplayLink
 

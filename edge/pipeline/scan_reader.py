@@ -20,8 +20,7 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import POLL_S
 from firmware_bridge.sensor_file.model import SensorFile
 
-CAPACITY_SCANS: Final = 1024
-"""Scans that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
+CAPACITY_SCANS: Final = 1024  # that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets them
 
 
 class Source:
@@ -29,20 +28,7 @@ class Source:
 
     Reading begins when its links are open: scans that come while a model loads wait here. Scans of one link stay in
     their order; a link that is slow or away holds up no other, and one that is lost for good ends the source. A patient
-    link is read by the thread that takes, a scan at a time, so that nothing is discarded or overtaken. A source is
-    opened once.
-
-    Attributes:
-        name: as a user would write it, such as "slcan:/dev/ttyUSB0"; of several links, all their names.
-        patient: True if the link waits for its reader, and its scans have another clock than now.
-        length_s: length of the longest recording, in [s]; None where there is none.
-        states_poses: True if poses of some sensors come with the scans, as in a recording.
-        prefixes: beginnings of the names of the sensors of each link, such as "left/".
-        sensor_file: properties of its sensors.
-        rate_hz: requested rate of each sensor, in [Hz]; None without.
-        overruns: scans discarded.
-        last_ns: time of the last scan taken of a patient link, in [ns]; None before.
-        pace: the times of reading its links; any thread may set it.
+    link is read by the thread that takes, a scan at a time, so that nothing is discarded or overtaken.
     """
 
     def __init__(
@@ -52,27 +38,20 @@ class Source:
         rate_hz: float | None = None,
         give_up_s: float = 0.0,
     ) -> None:
-        """Prepare to read one or more links that are not open yet; this source opens and closes them.
-
-        A lost link is opened again; `give_up_s` is the longest time that one may be away, in [s], and at 0 its first
-        loss is raised.
-
-        Raises:
-            SourceError: some are emulated and some are not: results of both kinds must not be mixed.
-        """
+        """Prepare to read links that are not open yet, all emulated or none; one may be away for `give_up_s` [s]."""
         _one_kind(links)
         self.name = ", ".join(link.name for link in links)
-        self.patient = len(links) == 1 and links[0].patient
-        self.prefixes = tuple(link.prefix for link in links)
+        self.patient = len(links) == 1 and links[0].patient  # it waits for its reader, and its scans are not of now
+        self.prefixes = tuple(link.prefix for link in links)  # of the names of each link's sensors, such as "left/"
         self.length_s = max((link.length_s for link in links if link.length_s is not None), default=None)
         self.states_poses = any(link.states_poses for link in links)
         self.sensor_file = SensorFile() if sensor_file is None else sensor_file
-        self.rate_hz = rate_hz
-        self.overruns = 0
-        self.pace = ReadingPace()
+        self.rate_hz = rate_hz  # requested of each sensor
+        self.overruns = 0  # scans discarded
+        self.pace = ReadingPace()  # any thread may set it
         self._stop = threading.Event()
         self._readers = [LinkReader(link, give_up_s, sleep=self._stop.wait) for link in links]
-        self.last_ns: int | None = None
+        self.last_ns: int | None = None  # time of the last scan taken of a patient link
         self._opened = self._closed = False
         self._open = ExitStack()
         self._threads: list[threading.Thread] = []
@@ -97,13 +76,7 @@ class Source:
         self.close()
 
     def open(self) -> Self:
-        """Open the links and begin to read; `close` ends it, as does the end of a with statement or of the program.
-
-        Raises:
-            UsageError: it was opened before.
-            SensorFileError: the sensor file is of an emulated sensor, and the scans are not.
-            BridgeError: a link cannot be opened.
-        """
+        """Open the links and begin to read, or raise a BridgeError; `close` or the end of the program ends it."""
         if self._opened or self._closed:
             state = "opened" if self._opened else "closed"
             raise UsageError(f"source {self.name} was {state} before: make another, with open_source")
@@ -130,11 +103,7 @@ class Source:
         self._open.close()
 
     def reserve(self, stream: Any = None) -> None:
-        """Let a `Stream` take the scans from now on; None only asks whether one could.
-
-        Raises:
-            UsageError: another stream does.
-        """
+        """Let a `Stream` take the scans from now on, or raise a UsageError if another does; None only asks."""
         before = self._stream()
         if before is not None and not before.ended:
             raise UsageError(
@@ -146,11 +115,7 @@ class Source:
 
     @property
     def kind(self) -> SourceKind:
-        """Kind of source.
-
-        Raises:
-            UsageError: it is not open yet, and some links learn their kind only then.
-        """
+        """Kind of source, or a UsageError before it is open, as some links learn their kind only then."""
         if not self._opened:
             raise self._not_open()
         return self._readers[0].link.kind
@@ -179,12 +144,7 @@ class Source:
         return time.time() if offset_ns is None else ((self.last_ns or 0) + offset_ns) / 1e9
 
     def take(self, timeout_s: float) -> list[Scan | Notice | TimedPose] | None:
-        """Return all that waits, in order, after waiting at most `timeout_s` for it; None when no more will come.
-
-        Raises:
-            LinkLostError: or another error that ended the reading, after all scans before it were taken.
-            UsageError: it is not open.
-        """
+        """Return all that waits, after at most `timeout_s`; after all scans None, or raise what ended the reading."""
         if not self._opened or self._closed:
             raise self._not_open()
         if self.patient:
@@ -220,10 +180,7 @@ class Source:
         return UsageError(f"source {self.name} is not open: use it in a with statement, or call open()")
 
     def _started(self, reader: LinkReader) -> threading.Thread:
-        """Return a new thread that reads a link; its error ends all reading, and is raised by `take`.
-
-        It is a daemon, or a program that forgets to close its source would wait for it for ever.
-        """
+        """Return a new thread that reads a link; its error ends all reading, and is raised by `take`."""
 
         def read() -> None:
             try:
@@ -236,6 +193,7 @@ class Source:
                 if not self._reading:
                     self._bell.put(None)
 
+        # A daemon, or a program that forgets to close its source would wait for it for ever.
         thread = threading.Thread(target=read, name="scan-reader", daemon=True)
         thread.start()
         return thread

@@ -12,30 +12,19 @@ from firmware_bridge.poses import TimedPose
 
 
 class Sink(Protocol):
-    """Destination of results. Inherit it to get the optional methods.
+    """Destination of results. Inherit it to get the optional methods."""
 
-    Attributes:
-        unwritten: records left out so far, because the reader is too slow.
-        uses_poses: True where its results depend on poses, as those of a map do.
-        patience_s: longest time for which results of a sensor at rest may wait for it, in [s].
-        trouble: what is wrong with it, in plain words for the user; None while all is well.
-    """
-
-    unwritten: int = 0
-    uses_poses: bool = False
-    patience_s: float = 0.0
+    unwritten: int = 0  # records left out so far, because the reader is too slow
+    uses_poses: bool = False  # its results depend on poses, as those of a map do
+    patience_s: float = 0.0  # longest time for which results of a sensor at rest may wait for it
 
     @property
-    def trouble(self) -> str | None:  # noqa: D102 - above
+    def trouble(self) -> str | None:
+        """What is wrong with it, in plain words for the user; None while all is well."""
         return None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Take one result, with the counters of received, dropped and lost scans up to it.
-
-        Raises:
-            SinkError: it cannot be written.
-            SinkClosedError: its reader has gone.
-        """
+        """Take one result, and the counters up to it; raises SinkError, or SinkClosedError if its reader has gone."""
         ...
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:

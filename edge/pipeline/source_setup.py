@@ -26,12 +26,7 @@ def unmapped(pad: SensorGeometry) -> str | ModelMap:
 
 
 def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) -> SensorFile:
-    """Return the settings of the sensors, by a sensor file and an id map as requested.
-
-    Raises:
-        SensorFileError: the sensor file cannot be used.
-        UsageError: the id map does not exist, or the file is of another, with another order and baseline.
-    """
+    """Return the settings of the sensors, by a sensor file and an id map as requested; raises where they differ."""
     if isinstance(id_map, ModelMap):
         if sensor is not None:
             raise UsageError(f"id map {id_map.name} of the program's own, and {sensor}: leave one of them out")
@@ -48,14 +43,7 @@ def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) ->
 
 
 def links_to(texts: Sequence[str], sensor_file: SensorFile, rate_hz: float | None) -> tuple[list[Link], SensorFile]:
-    """Return the links to the requested sources, else to the sensor file's adapter or the only one; not yet entered.
-
-    With them come the settings of their sensors, as `with_recorded` makes them.
-
-    Raises:
-        SourceError: as in open_sources; NoDeviceError and RecordingError as well.
-        UsageError: a source is not a text; the rate is out of range; the demo's recording is not installed.
-    """
+    """Return the links to the requested sources, else to the only adapter, not yet entered, and sensors' settings."""
     if rate_hz is not None:
         check_positive("rate_hz", rate_hz)
     for text in texts:
@@ -76,11 +64,7 @@ def with_recorded(sensor_file: SensorFile, links: Iterable[Link]) -> SensorFile:
 
 
 def refuse_emulated(sensor_file: SensorFile, kind: SourceKind, origin: SourceKind | None) -> None:
-    """Refuse to use settings of an emulated sensor on a device, or on a recording of anything else.
-
-    Raises:
-        SensorFileError: the sensor file is of an emulated sensor, in part or whole.
-    """
+    """Raise a SensorFileError for settings of an emulated sensor on a device, or on a recording of anything else."""
     if "emulated" in (kind, origin):
         return
     this = "recording is not known to be of one" if kind == "replay" else "is a device"
@@ -96,15 +80,12 @@ def refuse_emulated(sensor_file: SensorFile, kind: SourceKind, origin: SourceKin
 def stored_baselines(
     baselines: Mapping[str, Baseline] | str | Path | None, sensor_file: SensorFile
 ) -> Mapping[str, Baseline]:
-    """Return the baselines of free pads: stored ones, or their file, before those of the sensor file.
-
-    One that a program has kept for FRESH_S, or of an unknown date, is as old as one of a file: it is in doubt as well.
-    """
+    """Return the baselines of free pads: stored ones, or their file, before those of the sensor file."""
     if isinstance(baselines, (str, Path)):
         return load_baselines(baselines, sensor_file.orders)
     if not isinstance(baselines, Mapping):  # which is refused where the runtime is made
         return sensor_file.baselines if baselines is None else baselines
-    now_s = time.time()
+    now_s = time.time()  # one that a program has kept for long is as old as one of a file, and in doubt as well
     return {
         name: replace(one, origin="file") if isinstance(one, Baseline) and not one.age_s(now_s) < FRESH_S else one
         for name, one in baselines.items()

@@ -20,20 +20,16 @@ def columns() -> int:
 
 
 def wrapped(text: str, width: int, start: str = "", indent: str = "") -> list[str]:
-    """Wrap a paragraph into lines of `width` columns, of which the first begins with `start`, the others with `indent`.
-
-    A wider word stays whole, since paths and options are copied from the text.
-    """
+    """Wrap a paragraph after `start`, further lines after `indent`; a wider word stays whole, as it may be copied."""
     return textwrap.wrap(
         text, width, initial_indent=start, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
     )
 
 
 class HelpFormatter(argparse.HelpFormatter):
-    """Formatter that lays out descriptions and epilogues by the form of each line.
+    """Formatter that keeps lines which begin with a space, and makes of others a paragraph, or an entry at a tab.
 
-    A line with a tab is an entry of a list: a term, and its meaning in the column of the options' meanings. A line that
-    begins with a space is kept. Any other line is a paragraph.
+    An entry of a list is a term, and its meaning in the column of the options' meanings.
     """
 
     def __init__(self, prog: str) -> None:
@@ -41,27 +37,17 @@ class HelpFormatter(argparse.HelpFormatter):
         self._width = max(min(self._width, 80), FEWEST_COLUMNS)
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        return "\n".join(
-            indent + line
-            for paragraph in text.splitlines()
-            for line in self._laid_out(paragraph, self._width - len(indent))
-        )
+        return "\n".join(line for paragraph in text.splitlines() for line in self._laid_out(paragraph))
 
-    def _laid_out(self, line: str, width: int) -> list[str]:
+    def _laid_out(self, line: str) -> list[str]:
         term, tab, meaning = line.partition("\t")
         if not tab:
-            return [line] if line.startswith(" ") else textwrap.wrap(line, width) or [""]
-        column = min(self._max_help_position, width // 2)
-        beside = len(term) + 4 <= column
-        first = f"  {term}"
-        lines = textwrap.wrap(
-            meaning,
-            width,
-            initial_indent=first.ljust(column) if beside else " " * column,
-            subsequent_indent=" " * column,
-            break_on_hyphens=False,
-        )
-        return lines if beside else [first, *lines]
+            return [line] if line.startswith(" ") else wrapped(line, self._width) or [""]
+        column = min(self._max_help_position, self._width // 2)
+        first, indent = f"  {term}", " " * column
+        if len(first) + 2 <= column:
+            return wrapped(meaning, self._width, first.ljust(column), indent)
+        return [first, *wrapped(meaning, self._width, indent, indent)]
 
 
 EXIT_USAGE: Final = 2

@@ -1,8 +1,7 @@
 """End of a program on Ctrl-C and similar signals: after the scans in hand, and if necessary by force.
 
-Python runs a handler of signals between two steps of its main thread, and so never while a call into a library does
-not return: a model that loops, a pipe that is full, a peer that is gone. The system's own part of a handler runs all
-the same, and wakes a thread here.
+Python runs no handler while a call into a library does not return: a model that loops, a pipe that is full. The
+system's own part of a handler runs all the same, and wakes a thread here.
 """
 
 import contextlib
@@ -12,21 +11,17 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 END_S: Final = 5.0  # time from the signal to the end by force
-EXIT_FORCED: Final = 6
-STDIN, STDERR = 0, 2
+STDERR = 2
 
 
 @contextlib.contextmanager
 def handled(names: Iterable[str], handle: Callable[[int, Any], object]) -> Iterator[Collection[int]]:
-    """Handle signals within a with statement, and yield their numbers.
-
-    Signals that the parent has this program ignore stay ignored: nohup does so with a hang-up, and a shell without jobs
-    with the Ctrl-C that is meant for another program in front.
-    """
+    """Handle signals within a with statement, and yield their numbers."""
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    # What the parent ignores stays so: a hang-up under nohup, Ctrl-C that is for another program.
     before = {number: signal.getsignal(number) for number in numbers if signal.getsignal(number) != signal.SIG_IGN}
     for number in before:
         signal.signal(number, handle)
@@ -50,9 +45,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
     woken.setblocking(False)
     with handled(("SIGINT", "SIGTERM", "SIGHUP"), handle) as numbers:
         before = signal.set_wakeup_fd(woken.fileno(), warn_on_full_buffer=False)
-        # The terminal as it is now: the caller may change it before the thread runs.
-        watched = (waking, numbers, _terminal_settings())
-        thread = threading.Thread(target=_watch, args=watched, name="ending", daemon=True)
+        thread = threading.Thread(target=_watch, args=(waking, numbers), name="ending", daemon=True)
         thread.start()
         try:
             yield stop
@@ -63,36 +56,18 @@ def stop_on_signals() -> Iterator[threading.Event]:
             waking.close()
 
 
-def _watch(waking: socket.socket, numbers: Collection[int], terminal: list[Any] | None) -> None:
-    """End the process by force if it goes on for END_S after one of these signals, and after any that come later."""
-    stopping = False
+def _watch(waking: socket.socket, numbers: Collection[int]) -> None:
+    """Kill the process if it goes on for END_S after the last of these signals."""
     while True:
         try:
             received = waking.recv(64)
         except TimeoutError:
-            _force(terminal)
+            with contextlib.suppress(OSError):
+                if select.select([], [STDERR], [], 0)[1]:  # an unread pipe may be what blocks the program
+                    os.write(STDERR, f"edge-sr: not ended {END_S:g} s after the signal: ended by force\n".encode())
+            os.kill(os.getpid(), signal.SIGKILL)  # a shell restores the terminal after a signal, not after an exit
+            return
         if not received:
             return
-        if not stopping and set(numbers) & set(received):
-            stopping = True
+        if set(numbers) & set(received):
             waking.settimeout(END_S)
-
-
-def _terminal_settings() -> list[Any] | None:
-    with contextlib.suppress(ImportError, OSError):
-        import termios
-
-        return termios.tcgetattr(STDIN) if os.isatty(STDIN) else None
-    return None
-
-
-def _force(terminal: list[Any] | None) -> NoReturn:
-    if terminal is not None:  # a shell does not restore it after a program that exits
-        import termios
-
-        with contextlib.suppress(termios.error):
-            termios.tcsetattr(STDIN, termios.TCSANOW, terminal)
-    with contextlib.suppress(OSError):
-        if select.select([], [STDERR], [], 0)[1]:  # an unread pipe may be what blocks the program
-            os.write(STDERR, f"edge-sr: not ended {END_S:g} s after the signal: ended by force\n".encode())
-    os._exit(EXIT_FORCED)

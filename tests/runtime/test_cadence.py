@@ -8,15 +8,7 @@ import pytest
 from edge_samples import make_scan
 
 from edge.perception.result import Result
-from edge.pipeline.cadence import (
-    FEWEST_INTERVALS,
-    LONGEST_BURST,
-    SENSOR_SILENT_NS,
-    SETTLING_SCANS,
-    Cadence,
-    Cadences,
-    ReadingPace,
-)
+from edge.pipeline.cadence import FEWEST_INTERVALS, SENSOR_SILENT_NS, SETTLING_SCANS, Cadence, Cadences, ReadingPace
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS
@@ -46,9 +38,7 @@ def followed(intervals_ms, rate_hz=None):
         ([10] * (FEWEST_INTERVALS - 1), None),
         ([10] * FEWEST_INTERVALS, 10),
         ([9, 11, 10, 10, 900, 10, 1, 9, 11], 10),  # the median of what came
-        ([20] * 40 + [5] * 31, 5),
-        ([10] * 40 + [400] + [0.3] * 39 + [10] * 5, 10),  # scans that were held up come in a burst
-        ([10] * 40 + [0.5] * (LONGEST_BURST + 40), 0.5),  # a sensor that has become much faster
+        ([10] * 40 + [0.5] * 31, 0.5),  # a sensor that has become much faster
         ([10, 0, 10, 0, 10, 0, 10, 0, 10], 10),  # scans of one read
     ],
 )
@@ -64,14 +54,6 @@ def test_scans_that_lay_unread_set_no_pace():
         cadence.follow(replace(scan(number, time_ms), unread_ns=400 * MS * (time_ms < 520)))
         assert cadence.period_ns in (None, 10 * MS)
     assert cadence.rate_hz == 100
-
-
-def test_a_pattern_is_late_after_one_period_and_not_before():
-    for latency_us, late in ((10_000, 0), (10_000.001, 9 - FEWEST_INTERVALS)):
-        cadences = Cadences()
-        for number in range(9):
-            follow(cadences, scan(number, 10 * number), latency_us=latency_us)
-        assert cadences.late == late
 
 
 @pytest.mark.parametrize(
@@ -104,26 +86,6 @@ def test_missed_scans_are_counted_by_gaps(scans, missed):
     assert cadences.missed == missed
 
 
-def missed_of(arrivals):
-    """Return what is missed of scans that arrive so, each given as a scan, at the pace that they show."""
-    cadences = Cadences()
-    for one in arrivals:
-        follow(cadences, one)
-    return cadences.missed
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_a_stall_that_lost_nothing_misses_nothing(seed):
-    """The median of the newest intervals, 1 % off, once made a second a period too long."""
-    noise, arrivals = random.Random(seed), []
-    for number in range(1000):
-        due_ms = 10 * number + noise.uniform(-1, 1)
-        held_ms = max(due_ms, 2500 if 1500 <= due_ms < 2500 else 0, 6200 if 5400 <= due_ms < 6200 else 0)
-        late_ms = noise.expovariate(0.5) if noise.random() < 0.05 else 0.2
-        arrivals.append(replace(scan(number, 0), time_ns=round((held_ms + late_ms) * MS) + number))
-    assert missed_of(arrivals) == 0
-
-
 def busy_reader(seed, *, stamped, away_ms, busy, lost=()):
     """Return a thousand scans that came when the reader had time, which it lacked at first."""
     noise, free_ms, arrival_ms, arrivals = random.Random(seed), away_ms, 0.0, []
@@ -135,6 +97,13 @@ def busy_reader(seed, *, stamped, away_ms, busy, lost=()):
         one = scan(number, arrival_ms, device_ms=round(due_ms) if stamped else None)
         arrivals.append(replace(one, unread_ns=round((arrival_ms - due_ms) * MS) * (arrival_ms - due_ms > 50)))
     return arrivals
+
+
+def missed_of(arrivals):
+    cadence = Cadence()
+    for one in arrivals:
+        cadence.follow(one)
+    return cadence.missed
 
 
 @pytest.mark.parametrize("away_ms", [0, 500])

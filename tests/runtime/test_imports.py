@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 from bridge_samples import make_counts, write_recording
@@ -16,18 +15,9 @@ from firmware_bridge.errors import how_to_install, need
 
 FORBIDDEN = {"torch", "onnx", "trimesh", "scipy", "shapely", "skimage", "pytest", "hypothesis"}
 UNUSED_IN_A_REPLAY = {
-    *(
-        "edge.sinks.json_records",
-        "edge.sinks.converted_files",
-        "edge.sinks.ros2.sink",
-        "cyclonedds",
-        "tqdm",
-        "edge.bench",
-    ),
-    *("edge.cli.demo", "cyclonedds", "tqdm", "websockets", "usb", "can", "subprocess"),
-    *("firmware_bridge.emulation.slcan_emulator", "firmware_bridge.links.demo"),
-    *("firmware_bridge.links.slcan_serial", "firmware_bridge.links.xela_server"),
-    *("firmware_bridge.links.gs_usb_link", "firmware_bridge.links.can_bus"),
+    *("edge.bench", "edge.cli.demo", "edge.sinks.json_records", "edge.sinks.converted_files", "edge.sinks.ros2.sink"),
+    *("cyclonedds", "tqdm", "websockets", "usb", "can", "subprocess", "firmware_bridge.emulation.slcan_emulator"),
+    *(f"firmware_bridge.links.{name}" for name in ("demo", "slcan_serial", "xela_server", "gs_usb_link", "can_bus")),
 }
 MOST_MODULES = 101
 """Modules of ours that a run loads: each is work for a reader, and for a start."""
@@ -85,24 +75,6 @@ def test_a_run_loads_what_it_uses_and_leaves_no_trace(tmp_path):
     ours = [name for name in loaded if name.partition(".")[0] in ("edge", "firmware_bridge")]
     assert 50 < len(ours) <= MOST_MODULES, sorted(ours)
     assert (disabled, left, with_openssl) == ("1", "[]", "False")
-
-
-_GIVEN_BACK = """
-from pathlib import Path
-from edge.cli.run_command import give_back_memory
-def resident(): return int(Path("/proc/self/statm").read_text().split()[1])
-blocks = [bytes(5000) for _ in range(10_000)]
-kept = blocks[::100]
-del blocks
-full = resident()
-give_back_memory()
-print(full - resident())
-"""
-
-
-@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="glibc's heap is looked at on Linux")
-def test_free_memory_between_used_blocks_is_given_back():
-    assert int(run(_GIVEN_BACK)[0]) > 5000, "of the 12,000 pages that are free"
 
 
 NOTHING_INSTALLED = [sys.executable, "-E", "-S"]

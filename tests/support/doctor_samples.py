@@ -1,11 +1,10 @@
 """Samples for the doctor's tests: sensors that are well, each fault by itself, and fingers on corners."""
 
-import re
-
 import numpy as np
 
 from edge.doctor.guided_press import CORNERS
 from edge.doctor.link_checks import Watched
+from edge.doctor.rehearsal import load_asked
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
@@ -20,9 +19,9 @@ def healthy_counts(scans: int = 400, sigma: float = 2.0) -> np.ndarray:
     return np.rint(REST + noise).astype(np.int32)
 
 
-def times_ns(scans: int = 400, rate_hz: float = 100.0, seed: int = 1) -> np.ndarray:
+def times_ns(scans: int = 400, rate_hz: float = 100.0) -> np.ndarray:
     """Return times on a grid, each up to a millisecond early or late."""
-    jitter_s = np.random.default_rng(seed).uniform(-0.001, 0.001, scans)
+    jitter_s = np.random.default_rng(1).uniform(-0.001, 0.001, scans)
     return np.rint((np.arange(scans) / rate_hz + jitter_s + 1) * 1e9).astype(np.int64)
 
 
@@ -44,50 +43,22 @@ def watched(scans: list[Scan], duration_s: float = 4.0, **changes) -> Watched:
     return Watched(scans={"4": scans}, **settings)
 
 
-def finger(place: int) -> np.ndarray:
-    """Return z of a finger on a corner as a person sees it, (4, 4), in counts."""
-    rows, cols = np.indices((4, 4))
-    at_row, at_col = divmod(place, 4)
-    # A finger is wider than a taxel, and its middle lies a little inside.
-    at_row, at_col = 0.3 + 0.8 * at_row, 0.3 + 0.8 * at_col
-    return 4000.0 * np.exp(-((rows - at_row) ** 2 + (cols - at_col) ** 2) / 1.5)
-
-
-PUSHES = {0: (1, 1), 3: (-1, 1), 15: (-1, -1), 12: (1, -1)}
-WEIGHT_COUNTS = 2400.0
-
-
 class Person:
     """Holds a sensor, mounted somehow, and does what is asked; gives what the pad sends, scan by scan, without end."""
 
     shape = (1, 3, 4, 4)
 
-    def __init__(
-        self, mounting: Mounting | None = None, grip_counts: float = 4000.0, z_noise_counts: float = 2.0
-    ) -> None:
+    def __init__(self, mounting: Mounting | None = None, grip_counts: float = 4000.0) -> None:
         self._mounting = mounting or Mounting()
-        self._felt = self._free = np.zeros((3, 4, 4))
-        self._place = self._gripped = 0
-        self._grip_counts = grip_counts
-        self._noise_counts = np.array([2, 2, z_noise_counts])[:, None, None]
+        self._felt = np.zeros((3, 4, 4))
+        self._gripped, self._grip_counts = 0, grip_counts
         self._rng = np.random.default_rng(7)
 
     def hear(self, text: str) -> str | None:
         """Do what a request says, and return a line to type, if any."""
-        for place, corner in zip(USPA44.corners, CORNERS, strict=True):
-            if f"the {corner} corner" in text:
-                self._place = place
-                self._felt = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(place)])
-        if "push towards" in text:
-            x, y = PUSHES[self._place]
-            self._felt = self._felt + np.stack([0.2 * x * self._felt[2], 0.2 * y * self._felt[2], 0 * self._felt[2]])
-        if re.search(r"Lay \d+ g", text):
-            self._felt = np.zeros((3, 4, 4))
-            self._felt[2] = WEIGHT_COUNTS / 16
+        self._felt = load_asked(text, self._felt)
         if "Let the gripper close" in text:
             self._gripped = 150
-        if "et go" in text or "Take it off" in text:
-            self._felt = self._free
         return None
 
     def deformation(self) -> np.ndarray:
@@ -104,9 +75,7 @@ class Person:
                 self._gripped -= 1
                 self._felt = np.zeros((3, 4, 4))
                 self._felt[2] = (self._grip_counts if self._gripped else 0.0) / 16
-            yield np.rint(REST + self.deformation() + self._rng.normal(0, self._noise_counts, (3, 4, 4))).astype(
-                np.int32
-            )
+            yield np.rint(REST + self.deformation() + self._rng.normal(0, 2, (3, 4, 4))).astype(np.int32)
 
 
 def visit(mounting: Mounting | None = None, *, rest: int = 20) -> np.ndarray:
@@ -116,8 +85,8 @@ def visit(mounting: Mounting | None = None, *, rest: int = 20) -> np.ndarray:
     """
     person, seen = Person(mounting), []
     for corner in CORNERS:
-        for request, scans in (("Let go", rest), (f"the {corner} corner", 45), ("push towards", 45)):
+        for request, scans in (("Let go.", rest), (f"the {corner} corner", 45), ("push towards", 45)):
             person.hear(request)
             seen += [person.deformation()] * scans
-    person.hear("Let go")
+    person.hear("Let go.")
     return np.stack(seen + [person.deformation()] * 2 * rest)
