@@ -51,9 +51,7 @@ _ELSEWHERE: Final = {"scan_pose": ("pose",), "centre_of_pressure_mm": ("wrench",
 def write_npz(path: Path, recording: Recording) -> None:
     """Write arrays with a row for each scan of an .mcap; what a row lacks is unknown there.
 
-    Raises:
-        RecordingError: a result or a map cannot be read.
-        SinkError: patterns change their size.
+    Raises a RecordingError where a result cannot be read, a SinkError where patterns change their size.
     """
     with ExitStack() as opened:
         columns = _Columns(path.parent, opened)
@@ -203,7 +201,7 @@ class _Rows:
 
 
 def _value(field: Field, record: Mapping[str, Any], taps: int) -> Any:
-    """Return the value of a field in a record, as an array holds it."""
+    """Return a field of a record, as an array holds it."""
     value: Any = record
     for key in _ELSEWHERE.get(field.name, (field.name,)):
         value = None if value is None else value.get(key)

@@ -69,31 +69,17 @@ class McapScans:
     """Writer of scans and poses, and what they mean, into a new file; `add` puts other messages next to them.
 
     Every method but `abandon` raises an OSError where it, or an earlier record, cannot be written.
-
-    Attributes:
-        offset_ns: added to a time of the scans gives [ns] since 1970.
-        scans: number of scans on the disk so far, of all sensors.
-        messages: number of messages added so far.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        sensors: SensorFile,
-        offset_ns: int | None,
-        contract: dict[str, str],
-    ) -> None:
-        """Begin the file; one that exists is left alone.
+    def __init__(self, path: Path, sensors: SensorFile, offset_ns: int | None, contract: dict[str, str]) -> None:
+        """Begin the file, or raise a SinkError where it exists or cannot be written.
 
-        Without the mountings of the sensors, axes would point elsewhere when the file is played again. The offset is
-        None for the clocks as they are now. The contract is that of the model, as JSON by its keys.
-
-        Raises:
-            SinkError: the file exists, or cannot be written.
+        The offset gives [ns] since 1970, None for the clocks as they are now. The contract is JSON by its keys.
         """
         self._path = path
         self.offset_ns = time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns
-        self.scans = self.messages = 0
+        self.scans = 0  # on the disk so far, of all sensors
+        self._messages = 0
         taxels = sensors.geometry.taxel_count
         self._scan, self._baseline = scan_type(taxels), baseline_type(taxels)
         self._facts = {
@@ -157,12 +143,6 @@ class McapScans:
         self._added_scans += 1
         self.add(sensor, "scan", self._scan, unix_ns, encode_scan(scan, own, scan.on_bus_ns + self.offset_ns, *masks))
 
-    def add_poses(self, poses: Sequence[TimedPose]) -> None:
-        """Add poses."""
-        for pose in poses:
-            unix_ns = pose.time_ns + self.offset_ns
-            self.add("", "/poses", POSE, unix_ns, encode_pose(pose, unix_ns))
-
     def add(self, sensor: str, name: str, kind: MessageType, unix_ns: int, data: bytes) -> None:
         """Add a message to a topic of a sensor, or to the topic `name` itself where `sensor` is empty.
 
@@ -183,7 +163,7 @@ class McapScans:
         sequence = self._sequences[channel] & 0xFFFFFFFF
         self._jobs.append(partial(self._writer.add_message, channel, unix_ns, data, unix_ns, sequence))
         self._sequences[channel] += 1
-        self.messages += 1
+        self._messages += 1
         self._open_bytes += len(data)
         if self._open_bytes >= MOST_CHUNK_BYTES:
             self._hand_over()
@@ -213,7 +193,7 @@ class McapScans:
         """Close the file as it is; one without a message, or of which no scan could be written, is deleted."""
         self._executor.shutdown()
         self._file.close()
-        if not self.scans and (self._failed or not self.messages):
+        if not self.scans and (self._failed or not self._messages):
             self._path.unlink(missing_ok=True)
 
     def drain(self) -> None:
@@ -302,7 +282,7 @@ class McapSink(Sink):
 
     def pose(self, poses: Sequence[TimedPose]) -> None:
         """Add poses."""
-        self._try(self._act_if_room, self._file.add_poses, poses)
+        self._try(self._act_if_room, self._add_poses, poses)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Add an event."""
@@ -332,6 +312,11 @@ class McapSink(Sink):
         if force is not None:
             to.add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
         self._add_events(result.events)
+
+    def _add_poses(self, poses: Sequence[TimedPose]) -> None:
+        for pose in poses:
+            unix_ns = pose.time_ns + self._file.offset_ns
+            self._file.add("", "/poses", POSE, unix_ns, encode_pose(pose, unix_ns))
 
     def _add_events(self, events: Sequence[Event]) -> None:
         for event in events:

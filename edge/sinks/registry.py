@@ -27,15 +27,11 @@ _UNWRITTEN: Final = attrgetter("unwritten")
 
 
 class Fan(Sink):
-    """Fan-out of results and events to several sinks.
-
-    Attributes:
-        failures: of sinks given up, in their order.
-    """
+    """Fan-out of results and events to several sinks; the failure of the last one ends the run."""
 
     def __init__(self, tell: Callable[[Event], object], clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         """Begin without a sink; `tell` is called first with the event of one that is given up or reports trouble."""
-        self.failures: list[SinkError] = []
+        self.failures: list[SinkError] = []  # of sinks given up
         self._sinks: list[Sink] = []
         self._given_up_unwritten = 0
         self._counters: Mapping[str, int] = {}  # the newest, also for a sink that fails while no scan comes
@@ -45,7 +41,7 @@ class Fan(Sink):
         self._known_trouble: set[str] = set()
 
     def add(self, sink: Sink) -> None:
-        """Add one open sink; the failure of the last sink ends the run."""
+        """Add one open sink."""
         self._sinks.append(sink)
 
     @property
@@ -166,18 +162,11 @@ def open_sink(
 ) -> Sink:
     """Open a sink of results, as `edge-sr --sink` names it; close it after the last result is written.
 
-    Args:
-        text: "jsonl:FILE", "mcap:FILE.mcap", ...
-        contract: contract of the model that makes the results.
-        source: open source of the scans. Readers that are too slow miss records of a sensor, but never of a recording.
-        stop: set when the run is to end: then the sink no longer waits for readers of a recording's records either.
-        commands: those of the stream, for "ros2:TOPIC?commands", which takes zeroing and reset from the robot.
-        fields: those of JSON records, such as "force_n,pattern"; None for all.
-
-    Raises:
-        UsageError: the form does not exist (the message lists the forms), a field does not, or the source is not open;
-            a sink in metres for patterns of an unknown unit; a package is not installed.
-        SinkError: it cannot be opened.
+    `contract` is that of the model that makes the results, `source` the open source of their scans: readers that are
+    too slow miss records of a sensor, but never of a recording, unless `stop` is set. "ros2:TOPIC?commands" gives
+    `commands`, those of the stream, zeroing and reset from the robot. `fields` of JSON records, such as
+    "force_n,pattern", are all by default. Raises a UsageError where the form or a field does not exist or a package is
+    not installed, a SinkError where it cannot be opened.
     """
     name, target = check_sink(text)
     check_kind("contract", contract, "output_unit", "that of the model, as load_model(...).contract")

@@ -38,11 +38,7 @@ CLOSED: Final = {
 
 
 class ZenohSink(Sink):
-    """Publisher of KEY/SENSOR/scan, KEY/SENSOR/pattern and KEY/event, alive as KEY/alive/ID.
-
-    Attributes:
-        zid: the session's id, which the time stamp of every message holds, too.
-    """
+    """Publisher of KEY/SENSOR/scan, KEY/SENSOR/pattern and KEY/event, alive as KEY/alive/ID."""
 
     def __init__(self, target: str, source: Source) -> None:
         """Open a session; it does not matter whether a subscriber is there, now or later."""
@@ -59,7 +55,7 @@ class ZenohSink(Sink):
         congestion = zenoh.CongestionControl
         self._congestion = congestion.BLOCK if source.kind == "replay" else congestion.DROP
         with opening():
-            self.zid = str(self._session.zid())
+            self.zid = str(self._session.zid())  # which the time stamp of every message holds, too
             self._events = self._publisher(f"{self._key}/event", "application/json")
             self._read = True  # until a result shows that there is no subscriber
             self._alive = self._session.liveliness().declare_token(f"{self._key}/alive/{self.zid}")

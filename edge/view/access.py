@@ -2,10 +2,8 @@
 
 A browser runs pages of strangers, which can reach a server on loopback, too. Three things keep them out: the name that
 the browser was asked to reach (a stranger's name may resolve to this machine), the origin of the page that opens a
-socket, and, where other machines can reach the server, a token.
-
-A proxy may ask under its own name for this server, so that the origin of our page differs from the name: such a page
-needs the token, which no stranger knows.
+socket, and, where other machines can reach the server, a token. Behind a proxy the origin of our page differs from the
+name: such a page needs the token, too.
 """
 
 import hmac
@@ -32,15 +30,11 @@ _HOST: Final = re.compile(r"(?:\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[\w.-]+)
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Conditions that a request must meet.
+    """Conditions that a request must meet."""
 
-    The server listens at `host`, a name or an address; `name` is that of this machine, with or without a domain. The
-    token is None where it is not needed.
-    """
-
-    host: str
-    name: str
-    token: str | None
+    host: str  # name or address at which the server listens
+    name: str  # of this machine, with or without a domain
+    token: str | None  # None where it is not needed
 
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> tuple[HTTPStatus, str] | None:
         """Return status and reason with which a request is refused; None if it is granted.

@@ -106,13 +106,7 @@ class Connection(ServerConnection):
 
 
 class LiveView:
-    """Live page of a run; the port is taken at once, and pages are answered from `begin` on.
-
-    Attributes:
-        sinks: sinks that the loop writes to; they never fail.
-        url: the page's address.
-        other_urls: more addresses of it, where it listens at all addresses of this machine.
-    """
+    """Live page of a run; the port is taken at once, and pages are answered from `begin` on."""
 
     def __init__(self, host: str, port: int, token: str | None, contract: Contract, commands: Commands) -> None:
         """Take the port, 0 for any free one, where `host` leads.
@@ -134,7 +128,7 @@ class LiveView:
         self._looked_at = threading.Event()
         self._snapshot = RunSnapshot()
         self._snapshot.wake = self._wake_if_watched
-        self.sinks: list[Sink] = [self._snapshot]
+        self.sinks: list[Sink] = [self._snapshot]  # which the loop writes to; they never fail
         addresses = own_addresses() if is_everything(host) and ":" not in host else []
         self.url, *self.other_urls = self._access.urls(self._socket.getsockname()[1], addresses)
 

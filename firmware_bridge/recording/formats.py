@@ -8,11 +8,7 @@ from firmware_bridge.recording.tracks import Recording
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format.
-
-    Raises:
-        RecordingError: the file cannot be read, is no recording, or a value in it is impossible.
-    """
+    """Read a recording in the format of its name's ending, or raise a RecordingError."""
     path = Path(path)
     if path.is_dir():
         there = sorted(file.name for file in path.glob("*") if file.suffix in (".mcap", ".npz", ".csv"))[:5]

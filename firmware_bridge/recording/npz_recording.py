@@ -46,9 +46,7 @@ _BROKEN: Final = (
 def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDArray[Any]]:
     """Read the arrays of these names that are in the file, of `most_bytes` together; others are not read.
 
-    Raises:
-        NpzError: not an archive of plain arrays of numbers and text, damaged, or larger.
-        OSError: the file cannot be read.
+    Raises an NpzError for anything but a whole archive of plain arrays of numbers and text, or a larger one.
     """
     try:
         with (

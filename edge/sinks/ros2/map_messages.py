@@ -85,10 +85,7 @@ def grid(name: str, values: NDArray[np.float32], frame: str, unix_ns: int, geome
 
 
 def recorded_map(data: bytes) -> NDArray[np.float32]:
-    """Return the map (H, W), or (3, H, W) of vectors, in a Grid.
-
-    Raises a CdrError where it is none, a ValueError where it is of other numbers.
-    """
+    """Return the map (H, W), or (3, H, W) of vectors, in a Grid; a CdrError or ValueError where it is none of ours."""
     message = GRID.decode(data)
     count, kinds = len(message["fields"]), {field["type"] for field in message["fields"]}
     if kinds != {_FLOAT32}:
