@@ -79,7 +79,6 @@ class McapScans:
         self._path = path
         self.offset_ns = time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns
         self.scans = 0  # on the disk so far, of all sensors
-        self._messages = 0
         taxels = sensors.geometry.taxel_count
         self._scan, self._baseline = scan_type(taxels), baseline_type(taxels)
         self._facts = {
@@ -163,7 +162,6 @@ class McapScans:
         sequence = self._sequences[channel] & 0xFFFFFFFF
         self._jobs.append(partial(self._writer.add_message, channel, unix_ns, data, unix_ns, sequence))
         self._sequences[channel] += 1
-        self._messages += 1
         self._open_bytes += len(data)
         if self._open_bytes >= MOST_CHUNK_BYTES:
             self._hand_over()
@@ -193,7 +191,7 @@ class McapScans:
         """Close the file as it is; one without a message, or of which no scan could be written, is deleted."""
         self._executor.shutdown()
         self._file.close()
-        if not self.scans and (self._failed or not self._messages):
+        if not self.scans and (self._failed or not self._sequences):
             self._path.unlink(missing_ok=True)
 
     def drain(self) -> None:
@@ -235,22 +233,18 @@ class McapScans:
             job()
         if self._writer.finish not in jobs:
             self._writer.flush()
-        self.put(self._made)
-        self._made.clear()
-        self.scans = scans
-
-    def put(self, data: bytearray) -> None:
-        """Write all of the data or nothing: a disk that fills takes a part and refuses the rest."""
         try:
-            with memoryview(data) as left:
+            with memoryview(self._made) as left:
                 done = 0
                 while done < len(left):
                     done += self._file.write(left[done:])
-        except OSError:
+        except OSError:  # a disk that fills takes a part and refuses the rest
             self._failed = True
             os.ftruncate(self._file.fileno(), self._size_bytes)
             raise
-        self._size_bytes += len(data)
+        self._size_bytes += len(self._made)
+        self._made.clear()
+        self.scans = scans
 
 
 class McapSink(Sink):

@@ -11,11 +11,9 @@ import ipaddress
 import re
 import secrets
 import socket
-import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from fcntl import ioctl
 from http import HTTPStatus
 from typing import Final
 from urllib.parse import parse_qs
@@ -66,10 +64,7 @@ class Access:
         return None
 
     def urls(self, port: int, addresses: Sequence[str] = ()) -> list[str]:
-        """Return the addresses of the page, the most useful first.
-
-        Where the server listens at all `addresses` of this machine, its name is the last: others may not know it.
-        """
+        """Return the addresses of the page; this machine's name is the last, since others may not know it."""
         hosts = [*addresses, self.name] if is_everything(self.host) else [self.host]
         query = "" if self.token is None else f"?token={self.token}"
         return [f"http://{f'[{host}]' if ':' in host else host}:{port}{PAGE}{query}" for host in hosts]
@@ -126,17 +121,9 @@ def _same(given: str, token: str) -> bool:
     return hmac.compare_digest(given.encode(errors="surrogatepass"), token.encode())
 
 
-_REQUEST: Final = struct.Struct("16s4x4s232x")
-"""The kernel's `ifreq` with an IPv4 address: name of the interface, family and port, address; room for other uses."""
-
-
 def own_addresses() -> list[str]:
-    """Return the IPv4 addresses of this machine at which others on its networks reach it."""
-    addresses: list[str] = []
+    """Return the IPv4 address at which others reach this machine, of the network that leads elsewhere, if any does."""
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        for _, name in socket.if_nameindex():
-            with suppress(OSError):  # SIOCGIFADDR of an interface without an IPv4 address
-                answer = ioctl(asked, 0x8915, _REQUEST.pack(name.encode(), bytes(4)))
-                addresses.append(socket.inet_ntoa(_REQUEST.unpack(answer)[1]))
-    usable = (ip for ip in map(ipaddress.ip_address, addresses) if not (ip.is_loopback or ip.is_link_local))
-    return list(dict.fromkeys(map(str, usable)))
+        asked.connect(("192.0.2.1", 9))  # of documentation; nothing is sent
+        return [asked.getsockname()[0]]
+    return []

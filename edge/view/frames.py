@@ -221,7 +221,6 @@ def hello(source: Source, model: str, contract: Contract) -> bytes:
     height, width = contract.pattern_shape
     header = {
         "kind": "hello",
-        "version": 1,
         "run": secrets.token_hex(8),
         "name": harmless(source.name),
         "source": source.kind,
@@ -306,6 +305,4 @@ def execute(message: str | bytes, commands: Commands) -> str | None:
     commands.refuse()
     if command is not None:
         return f"{WAITING} commands are waiting: repeat it when the run has executed them"
-    shown = repr(message[:60])
-    shown = shown if len(message) <= 60 else f"{shown[:-1]}...{shown[-1]}"
-    return f"{shown} is not a command: expected {FORMS}"
+    return f"{message[:60]!r} is not a command: expected {FORMS}"

@@ -6,7 +6,6 @@ Each of its steps is short, since the loop cannot run meanwhile: it packs a fram
 import asyncio
 import base64
 import contextlib
-import errno
 import gc
 import hashlib
 import socket
@@ -286,10 +285,6 @@ def listen(host: str, port: int) -> socket.socket:
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening
     except OSError as error:
-        what, remedy = f"cannot listen on {host}:{port}: {error.strerror}", "name another port with --view"
-        if error.errno == errno.EADDRINUSE:
-            what = f"cannot listen on {host}:{port}: address in use"
-            remedy = "name another port with --view, or 0 for any free one"
-        elif isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-            what, remedy = f"{host} is not an address of this machine", "name one with --view-host, or leave it out"
-        raise SinkError(f"no live page: {what}; {remedy}") from error
+        remedy = "name another port with --view, 0 for any free one, or an address of this machine with --view-host"
+        why = str(error.strerror).partition(" (while")[0]  # Python adds the address again
+        raise SinkError(f"no live page: cannot listen on {host}:{port}: {why}; {remedy}") from error

@@ -9,6 +9,7 @@ from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
+import orjson
 import pytest
 from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
 from hypothesis import given, settings
@@ -16,9 +17,13 @@ from hypothesis import strategies as st
 from sink_samples import CONTRACT, RUN, make_results, make_sure_results
 
 from edge.api import Runtime, SinkError
-from edge.sinks.json_records import ALWAYS, has_room, pack, record_line
+from edge.sinks.json_records import ALWAYS, RecordForm, has_room, pack
 from edge.sinks.registry import open_sink
 from firmware_bridge.scans.scan import VendorReading
+
+
+def record_line(result, counters):
+    return orjson.dumps(RecordForm(maps=True).of(result, counters), option=orjson.OPT_SERIALIZE_NUMPY) + b"\n"
 
 
 class TestJsonLines:

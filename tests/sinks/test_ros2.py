@@ -13,6 +13,7 @@ from ros2_samples import ENVIRONMENT, TAG, Listener, Speaker, contact, keep_publ
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
 from edge_samples import fake_source, make_contract, make_wrench_result, wait_for
+from sink_samples import every_kind
 
 from edge.api import Command, Commands, Event, patches
 from edge.sinks.registry import open_sink
@@ -193,6 +194,25 @@ def test_who_joins_late_stops_or_dies_holds_up_nobody(sink):
             late.until(lambda: max(map(stamp_ns, late.of("skin/s4/pattern"))) >= newest, talker)
             assert min(map(stamp_ns, late.of("skin/s4/pattern"))) > joined_ns, "an old pattern for one who joined late"
         assert sink.unwritten == 0
+
+
+def test_each_kind_of_result_is_told(sink):
+    published = []
+    keep_published(sink, published)
+    for result in every_kind():
+        published.clear()
+        sink.write(result, {})
+        data = [one["data"] for one in published if type(one.get("data")) in (int, str)]
+        known = {None: -1, False: 0, True: 1}[result.trusted]
+        assert data[:2] == [known, result.state] or (result.state == "dropped" and data == [])
+        frame = result.scan.sensor if result.source == "device" else f"{result.source}/{result.scan.sensor}"
+        assert {one["header"]["frame_id"] for one in published if "encoding" in one} == {frame}
+    doubtful = without_pattern(contact(1), state="baseline_in_doubt", contact=None)
+    for result in (contact(0), doubtful):
+        published.clear()
+        sink.write(result, {})
+    images = [pixels(one | {"data": bytes(one["data"]).hex()}) for one in published if one.get("height") == 40]
+    assert all(np.isnan(image).all() for image in images) and len(images) == 2
 
 
 def test_a_force_of_which_a_part_is_not_known_is_no_wrench(sink):

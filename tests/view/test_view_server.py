@@ -113,8 +113,8 @@ def test_a_port_in_use_is_one_line_and_5(capsys):
         port = taken.getsockname()[1]
         assert main(["--source", "slcan:/dev/no-such-port", "--view", str(port)]) == 5
     assert capsys.readouterr().err == (
-        f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: address in use; "
-        "name another port with --view, or 0 for any free one\n"
+        f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: Address already in use; "
+        "name another port with --view, 0 for any free one, or an address of this machine with --view-host\n"
     )
 
 

@@ -37,7 +37,7 @@ from edge.sinks.ros2.messages import (
     base_topic,
     frame_of,
     header,
-    sensor_topic,
+    sensor_path,
     transforms,
     wrench,
     wrench_message,
@@ -83,7 +83,6 @@ class Ros2Sink(Sink):
         *,
         environment: Mapping[str, str] = os.environ,
         clock_ns: Callable[[], int] = time.monotonic_ns,
-        unix_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Join the domain of the environment; `topic` is the first part of all topics but diagnostics and frames.
 
@@ -94,7 +93,7 @@ class Ros2Sink(Sink):
         self._geometry, self._frames = source.sensor_file.geometry, source.sensor_file.frames
         offset_ns = source.unix_offset_ns
         self._of_now = offset_ns is None
-        self.unix_offset_ns = unix_ns() - clock_ns() if offset_ns is None else offset_ns
+        self.unix_offset_ns = time.time_ns() - clock_ns() if offset_ns is None else offset_ns
         self.unwritten = 0
         self._sensors: dict[str, _Sensor] = {}
         self._domain, self._participant = join(environment)
@@ -178,7 +177,7 @@ class Ros2Sink(Sink):
         """Publish what `make` returns, if anybody subscribes: that costs far more than to ask."""
         to = sensor.writers.get(what)
         if to is None:
-            topic = sensor_topic(self._base, sensor.last.scan.sensor, what)
+            topic = f"{self._base}/{sensor_path(sensor.last.scan.sensor)}/{what}"
             to = sensor.writers[what] = writer(self._participant, topic, kind)
         if self.is_read(to):
             self.publish(to, make())
