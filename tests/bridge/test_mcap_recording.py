@@ -5,7 +5,7 @@ import json
 import threading
 import time
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path, PosixPath
 from types import SimpleNamespace
 
@@ -304,13 +304,12 @@ def test_a_baseline_of_later_is_none_of_the_beginning(tmp_path):
     assert load_recording(record_into(tmp_path / "zeroed.mcap", results)).baselines == {}
 
 
-def scans_alone(path, to):
-    return messages_alone(path, to, topics="/s4/scan")
-
-
 @pytest.mark.parametrize(
     ("kind", "copy"),
-    [("device", Path.rename), ("emulated", Path.rename), ("emulated", messages_alone), ("emulated", scans_alone)],
+    [
+        *(("device", Path.rename), ("emulated", Path.rename), ("emulated", messages_alone)),
+        ("emulated", partial(messages_alone, topics="/s4/scan")),
+    ],
 )
 def test_an_emulated_sensor_stays_one_in_every_generation(tmp_path, kind, copy):
     path = record_into(tmp_path / "first.mcap", make_results([make_scan()], source=kind))
@@ -358,22 +357,15 @@ def test_recordings_of_before_stay_readable(tmp_path):
     assert recorded.items() <= texts.items()
 
 
-def metadata_alone(path, to):
-    """Copy a recording as the first release made it: what is known of its sensors in metadata, not in messages."""
-    records = {"mounting": {"sensor": "4", "mounting": mounting_text(TURNED)}, "source": {"kind": "emulated"}}
-    return messages_alone(path, to, ("/s4/scan", "/s4/baseline"), metadata=records)
-
-
 def test_the_mounting_and_the_origin_in_metadata_are_read(turned, tmp_path):
-    recording = load_recording(metadata_alone(turned, tmp_path / "first.mcap"))
+    """As the first release made it: what is known of its sensors in metadata, not in messages."""
+    topics, text = ("/s4/scan", "/s4/baseline"), mounting_text(TURNED)
+    records = {"mounting": {"sensor": "4", "mounting": text}, "source": {"kind": "emulated"}}
+    recording = load_recording(messages_alone(turned, tmp_path / "first.mcap", topics, metadata=records))
     assert (recording.origin, dict(recording.mountings)) == ("emulated", {"4": TURNED})
     assert not any("is not in the file" in note for note in recording.notes)
-
-
-def test_gains_of_a_mounting_are_not_left_out_unseen(turned, tmp_path):
-    fields = json.loads(mounting_text(TURNED)) | {"gains": [1.0] * 47 + [0.9]}
-    records = {"mounting": {"sensor": "4", "mounting": json.dumps(fields)}}
-    gained = messages_alone(turned, tmp_path / "gained.mcap", ("/s4/scan",), metadata=records)
+    records["mounting"]["mounting"] = json.dumps(json.loads(text) | {"gains": [1.0] * 47 + [0.9]})
+    gained = messages_alone(turned, tmp_path / "gained.mcap", topics, metadata=records)
     with pytest.raises(RecordingError, match="no mounting of sensor '4': it has gains, which this release does not"):
         load_recording(gained)
 

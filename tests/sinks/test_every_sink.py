@@ -21,7 +21,7 @@ from sink_samples import (
     make_sure_results,
 )
 
-from edge.api import Event, Fan, LinkLostError, PadPose, Sink, SinkClosedError, SinkError, TimedPose, UsageError
+from edge.api import Fan, LinkLostError, PadPose, Sink, SinkClosedError, SinkError, TimedPose, UsageError
 from edge.sinks.json_records import COUNTED_NS
 from edge.sinks.registry import FORMS, check_sink, open_sink
 
@@ -96,12 +96,21 @@ def full(tmp_path: Path) -> Sink:
     return open_sink("jsonl:/dev/full", CONTRACT, fake_source())
 
 
+def failing(*given):
+    raise SinkError("disk full")
+
+
+def fan_of(*sinks, tell=lambda event: None, clock_ns=lambda: 11):
+    fan = Fan(tell, clock_ns)
+    for sink in sinks:
+        fan.add(sink)
+    return fan
+
+
 @pytest.mark.parametrize("bad", [full, gone])
 def test_a_failing_sink_is_reported_and_the_others_go_on(bad, tmp_path):
-    events: list[Event] = []
-    fan, good = Fan(events.append, lambda: 11), ListSink()
-    for sink in (bad(tmp_path), good):
-        fan.add(sink)
+    events, good = [], ListSink()
+    fan = fan_of(bad(tmp_path), good, tell=events.append)
     results = every_kind()
     for result in results:
         fan.write(result, RUN)
@@ -114,11 +123,9 @@ def test_a_failing_sink_is_reported_and_the_others_go_on(bad, tmp_path):
 
 
 def test_the_last_sinks_failure_or_its_readers_end_ends_the_run(tmp_path):
-    for failing, kind in ((full(tmp_path), SinkError), (gone(tmp_path), SinkClosedError)):
-        fan = Fan(lambda event: None)
-        fan.add(failing)
+    for bad, kind in ((full(tmp_path), SinkError), (gone(tmp_path), SinkClosedError)):
         with pytest.raises(SinkError) as ended:
-            fan.write(every_kind()[0], RUN)
+            fan_of(bad).write(every_kind()[0], RUN)
         assert type(ended.value) is kind
 
 
@@ -186,23 +193,13 @@ def test_metres_need_a_model_whose_unit_is_known(form, tmp_path, monkeypatch):
 
 
 class TestFan:
-    class Failing(ListSink):
-        def __init__(self, error):
-            super().__init__(on_write=self.fail)
-            self.error = error
-
-        def fail(self, result):
-            if self.error is not None:
-                raise self.error
-
     def test_lasting_trouble_is_told_once_and_again_when_it_returns(self):
         class Troubled(ListSink):
             trouble = None
 
         now_ns, told = [0], []
-        fan, bad, good = Fan(told.append, lambda: now_ns[0]), Troubled(), ListSink()
-        fan.add(bad)
-        fan.add(good)
+        bad, good = Troubled(), ListSink()
+        fan = fan_of(bad, good, tell=told.append, clock_ns=lambda: now_ns[0])
         for time_ms, trouble in ((100, "nobody"), (600, "nobody"), (1200, "nobody"), (1800, None), (2400, "nobody")):
             now_ns[0], bad.trouble = time_ms * 1_000_000, trouble
             fan.write(make_results(1)[0], RUN)
@@ -213,10 +210,9 @@ class TestFan:
         assert good.events == told
 
     def test_one_that_fails_while_nothing_comes_is_given_up_too(self):
-        fan, good, bad = Fan(lambda event: None), ListSink(), ListSink()
-        bad.wait = lambda: self.Failing(SinkError("disk full")).fail(None)
-        fan.add(bad)
-        fan.add(good)
+        good, bad = ListSink(), ListSink()
+        bad.wait = failing
+        fan = fan_of(bad, good)
         fan.write(make_results(1)[0], RUN)
         fan.wait()
         fan.wait()
@@ -224,22 +220,16 @@ class TestFan:
         assert good.told_counters == [RUN]  # and of what was counted nothing is forgotten
 
     def test_the_runs_own_end_is_raised_not_an_earlier_sinks_failure(self):
-        fan = Fan(lambda event: None)
-        for sink in (self.Failing(SinkError("disk full")), ListSink()):
-            fan.add(sink)
+        fan = fan_of(ListSink(on_write=failing), ListSink())
         fan.write(make_results(1)[0], RUN)
         with pytest.raises(LinkLostError, match="gone"), contextlib.ExitStack() as closing:
             closing.callback(fan.close)
             raise LinkLostError("gone")
 
     def test_one_that_cannot_be_finished_hinders_no_other(self):
-        class Unfinished(ListSink):
-            def close(self):
-                raise SinkError("no room")
-
-        fan, good = Fan(lambda event: None), ListSink()
-        for sink in (Unfinished(), good):
-            fan.add(sink)
-        with pytest.raises(SinkError, match="no room"):
+        bad, good = ListSink(), ListSink()
+        bad.close = failing
+        fan = fan_of(bad, good)
+        with pytest.raises(SinkError, match="disk full"):
             fan.close()
         assert good.closed
