@@ -2,7 +2,6 @@
 
 import csv
 import json
-import shutil
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -97,11 +96,8 @@ class _Columns:
     def add_to(self, archive: zipfile.ZipFile) -> None:
         for name in sorted(self._columns, key=lambda name: name != "origin"):  # first: what loses its end has it
             file, dtype, shape, _ = self._columns[name]
-            file.seek(0)
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                header = {"descr": dtype.str, "fortran_order": False, "shape": (self._rows, *shape)}
-                npy.write_array_header_1_0(entry, header)
-                shutil.copyfileobj(file, entry, 1 << 20)
+            file.flush()
+            _add(archive, name, np.memmap(file, dtype, "r", shape=(self._rows, *shape)))
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:

@@ -48,7 +48,8 @@ class Access:
         given = parse_qs(query)
         # A browser sends no origin when a page asks why its socket was refused, so that the page names its own.
         origins = [*origins, *given.get("origin", [])]
-        trusted = self.token is not None and _same(given.get("token", [""])[-1], self.token)
+        token = given.get("token", [""])[-1].encode(errors="surrogatepass")
+        trusted = self.token is not None and hmac.compare_digest(token, self.token.encode())
         for origin in origins:
             if origin != f"http://{hosts[0]}" and not (place == SOCKET and trusted):
                 text = f"pages of {', '.join(origins)} may not send requests to this server"
@@ -115,10 +116,6 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return ipaddress.ip_address(host)
     except ValueError:
         return None
-
-
-def _same(given: str, token: str) -> bool:
-    return hmac.compare_digest(given.encode(errors="surrogatepass"), token.encode())
 
 
 def own_addresses() -> list[str]:

@@ -76,8 +76,7 @@ def _policy(script: bytes) -> str:
 LOOPBACK: Final = "127.0.0.1"
 STATE_S: Final = 1.0
 OPEN_S: Final = 5.0
-GONE_S: Final = 10.0
-"""Longest time for which a viewer reads nothing until it is disconnected, in [s]."""
+GONE_S: Final = 10.0  # longest time for which a viewer reads nothing until it is disconnected
 TIDY_CONNECTIONS: Final = 64
 
 
