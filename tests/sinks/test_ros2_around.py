@@ -65,9 +65,8 @@ def test_diagnostics_come_once_a_second_and_say_why_it_is_silent():
         return [(status["level"], status["message"]) for status in taken]
 
     assert written() == [(WARN, "2 dropped")]
-    for _ in range(99):
-        clock.now_ns += 10_000_000
-        sink.write(replace(idle, scan=replace(idle.scan, time_ns=clock.now_ns)), {"dropped": 2})
+    clock.now_ns += 990_000_000
+    sink.write(replace(idle, scan=replace(idle.scan, time_ns=clock.now_ns)), {"dropped": 2})
     assert statuses() == []
     assert written() == [(OK, "idle")]
     sink.tell(Event(clock.now_ns, "trouble", None, "bus-off"), {"dropped": 2})
@@ -199,9 +198,8 @@ def test_types_are_called_described_and_hashed_as_ros_does(kind):
 
 
 def test_a_taxel_that_gave_no_reading_is_not_a_number_of_counts():
-    image = map_messages.image(map_messages.taxels(make_scan(absent=(6,))), "4", UNIX_NS)
-    values = np.frombuffer(bytes(ros2_messages.decode("sensor_msgs/msg/Image", image)["data"]), "<f4")
-    assert np.isnan(values.reshape(3, 16)[:, 6]).all() and np.isnan(values).sum() == 3
+    values = map_messages.taxels(make_scan(absent=(6,))).reshape(3, 16)
+    assert np.isnan(values[:, 6]).all() and np.isnan(values).sum() == 3
 
 
 UNIX_NS = 1_700_000_000_123_456_789
