@@ -132,19 +132,6 @@ def seen_by(viewer):
     return frame(viewer, "state")[0]["viewers"]
 
 
-def test_who_never_reads_costs_little_and_harms_nobody(page, limits):
-    limits(frames, LATE_S=0.1)
-    with page.viewer() as other, page.stranger(HANDSHAKE) as blocked:
-        with page.playing():
-            shown = [frame(other, "result") for _ in range(30)]
-        sent = b""
-        blocked.settimeout(0.5)
-        with suppress(TimeoutError):
-            while data := blocked.recv(1 << 16):
-                sent += data
-    assert b'"hello"' in sent and len(sent) < 15 * sum(one.nbytes for one in shown[0][1].values())
-
-
 def test_the_place_of_who_takes_nothing_is_free_again(page, limits):
     """As of who never reads, and of whose network vanished: both look alike from here."""
     limits(server, GONE_S=1.5)
