@@ -118,11 +118,10 @@ class Fan(Sink):
 
 
 class Form(NamedTuple):
-    """Form of a sink: as a user writes it, what it is, and the check of its target."""
+    """Form of a sink: as a user writes it, and what it is."""
 
     text: str
     about: str
-    check: Callable[[str], object] = str
 
 
 def check_sink(text: str) -> tuple[str, str]:
@@ -136,7 +135,19 @@ def check_sink(text: str) -> tuple[str, str]:
         raise UsageError(f"no sink {text!r}: record by --sink {as_typed(f'mcap:{made}')}, then {then}")
     if form is None or (text != name if form.text == name else not target):
         raise UsageError(f"no sink {text!r}; sinks are {', '.join(form.text for form in FORMS.values())}")
-    form.check(target)
+    match name:
+        case "mcap" if not target.endswith(".mcap"):
+            raise UsageError(f"sink {text!r} names {target!r}, expected a file whose name ends in .mcap")
+        case "zenoh":
+            from edge.sinks.zenoh import parsed_target
+
+            parsed_target(target)
+        case "rerun":
+            from edge.sinks.rerun import check_target
+
+            check_target(target)
+        case "ros2":
+            _ros2_topic(target)
     return name, target
 
 
@@ -208,23 +219,6 @@ def open_sink(
             raise AssertionError(f"FORMS has {name}, which nothing opens")
 
 
-def _check_mcap(target: str) -> None:
-    if not target.endswith(".mcap"):
-        raise UsageError(f"sink 'mcap:{target}' names {target!r}, expected a file whose name ends in .mcap")
-
-
-def _check_zenoh(target: str) -> None:
-    from edge.sinks.zenoh import parsed_target
-
-    parsed_target(target)
-
-
-def _check_rerun(target: str) -> None:
-    from edge.sinks.rerun import check_target
-
-    check_target(target)
-
-
 def _ros2_topic(target: str) -> tuple[str, bool]:
     """Return the topic of a target, and whether commands are accepted."""
     from edge.sinks.ros2.messages import base_topic  # no other sink needs the messages of ROS
@@ -250,13 +244,11 @@ FORMS: Final = {
     "status": Form("status", "one live line (default on a terminal)"),
     "jsonl": Form("jsonl:FILE", "one JSON record a line; jsonl:- is stdout"),
     "mcap": Form(
-        "mcap:FILE.mcap",
-        "recording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it",
-        _check_mcap,
+        "mcap:FILE.mcap", "recording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it"
     ),
     "shm": Form("shm:NAME", "latest values in shared memory"),
-    "zenoh": Form("zenoh:KEY", "messages over zenoh; to a router with ?connect=tcp/HOST:7447", _check_zenoh),
-    "ros2": Form("ros2:TOPIC", "ROS 2 messages", _ros2_topic),
-    "rerun": Form("rerun:view", "a Rerun viewer; one that is open by HOST:PORT; FILE.rrd", _check_rerun),
+    "zenoh": Form("zenoh:KEY", "messages over zenoh; to a router with ?connect=tcp/HOST:7447"),
+    "ros2": Form("ros2:TOPIC", "ROS 2 messages"),
+    "rerun": Form("rerun:view", "a Rerun viewer; one that is open by HOST:PORT; FILE.rrd"),
 }
 """Forms of sinks by their names, in the order of the help."""

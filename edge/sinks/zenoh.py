@@ -48,13 +48,12 @@ class ZenohSink(Sink):
             import zenoh
         except ImportError as error:
             raise SinkError(f"zenoh: needs eclipse-zenoh: {how_to_install('zenoh')}") from error
-        with opening():
-            self._session = zenoh.open(_configured(configuration))
         self._failure = zenoh.ZError
         self._turns = CountersInTurn()
         congestion = zenoh.CongestionControl
         self._congestion = congestion.BLOCK if source.kind == "replay" else congestion.DROP
         with opening():
+            self._session = zenoh.open(_configured(configuration))
             self.zid = str(self._session.zid())  # which the time stamp of every message holds, too
             self._events = self._publisher(f"{self._key}/event", "application/json")
             self._read = True  # until a result shows that there is no subscriber
