@@ -1,7 +1,4 @@
-"""Users' files: written by a draft that is moved in place once it is complete, and read up to a limit.
-
-A path can also lead to an endless device.
-"""
+"""Users' files: written by a draft that is moved in place once it is complete, and read up to a limit."""
 
 import errno
 import os
@@ -52,7 +49,7 @@ def check_writable(path: Path) -> None:
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """Read a whole file, or raise an OSError where it is larger; at most a mebibyte beyond the limit is read."""
+    """Read a whole file, or raise an OSError where it is larger, as an endless device is."""
     content = bytearray()
     with path.open("rb") as file:
         while piece := file.read(1 << 20):  # one large read would allocate memory for the whole limit

@@ -173,11 +173,10 @@ def open_sink(
 ) -> Sink:
     """Open a sink of results, as `edge-sr --sink` names it; close it after the last result is written.
 
-    `contract` is that of the model that makes the results, `source` the open source of their scans: readers that are
-    too slow miss records of a sensor, but never of a recording, unless `stop` is set. "ros2:TOPIC?commands" gives
-    `commands`, those of the stream, zeroing and reset from the robot. `fields` of JSON records, such as
-    "force_n,pattern", are all by default. Raises a UsageError where the form or a field does not exist or a package is
-    not installed, a SinkError where it cannot be opened.
+    `contract` is that of the model, `source` the open source of the scans: readers that are too slow miss records of a
+    sensor, but never of a recording, unless `stop` is set. "ros2:TOPIC?commands" gives `commands`, those of the stream,
+    zeroing and reset from the robot. `fields` of JSON records, such as "force_n,pattern", are all by default. Raises a
+    UsageError where the form or a field does not exist or a package is missing, a SinkError where it cannot be opened.
     """
     name, target = check_sink(text)
     check_kind("contract", contract, "output_unit", "that of the model, as load_model(...).contract")

@@ -64,8 +64,7 @@ class Newest(NamedTuple):
 class RunSnapshot(Sink):
     """Newest result and trace of every sensor, and the latest events, in memory that does not grow with the run.
 
-    It calls `wake`, which never waits, when there is something to show, MAX_FPS times a second at most. So viewers are
-    served after a scan's last work and not by a clock of their own, while the loop sleeps.
+    After a scan's last work it calls `wake`, MAX_FPS times a second at most: viewers are served while the loop sleeps.
     """
 
     def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:

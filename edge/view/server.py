@@ -1,7 +1,4 @@
-"""Server of the live page: one thread, which sleeps until there is something to send and a viewer to send it to.
-
-Each of its steps is short, since the loop cannot run meanwhile: it packs a frame, and sends it.
-"""
+"""Server of the live page: one thread, whose steps are short, since the loop cannot run meanwhile."""
 
 import asyncio
 import base64
@@ -107,10 +104,9 @@ class LiveView:
     """Live page of a run; the port is taken at once, and pages are answered from `begin` on."""
 
     def __init__(self, host: str, port: int, token: str | None, contract: Contract, commands: Commands) -> None:
-        """Take the port, 0 for any free one, where `host` leads.
+        """Take the port, 0 for any free one; without a token one is made where other machines can reach `host`.
 
-        Requests must carry the token; None makes one where other machines can reach `host`. Raises UsageError where the
-        token is not valid, SinkError where the port cannot be taken.
+        Raises a UsageError for a token that cannot be one, a SinkError where the port cannot be taken.
         """
         self._access = grant(host, socket.gethostname(), token)
         self._contract, self._commands = contract, commands
@@ -150,8 +146,7 @@ class LiveView:
     ) -> None:
         """Answer requests from now on, about an open source and the model that the run begins with.
 
-        `messages` is called with an event if the page ends early, from the page's thread, and `looked_at` is set with
-        the first viewer.
+        If the page ends early its thread calls `messages`; `looked_at` is set with the first viewer.
         """
         self._messages, self._source = messages, source.kind
         self._looked_at = looked_at or self._looked_at

@@ -146,10 +146,7 @@ def load_csv(path: Path) -> Recording:
 
 
 class _Scans:
-    """Scans of the rows so far, in columns: a list of rows would take ten times the memory of the file.
-
-    A ValueError states what was got of a line, and what was expected.
-    """
+    """Scans of the rows so far, in columns: a list of rows would take ten times the memory of the file."""
 
     def __init__(self, header: Sequence[str]) -> None:
         """Sort the columns by their names."""

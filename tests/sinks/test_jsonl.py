@@ -43,7 +43,7 @@ class TestJsonLines:
             assert path.read_bytes() == expected, "there as soon as it is written"
         sink.close()
 
-    def test_a_second_run_and_one_that_does_not_begin_leave_the_records(self, tmp_path):
+    def test_a_run_that_cannot_begin_leaves_earlier_records(self, tmp_path):
         """As of `edge-sr --sink jsonl:out.jsonl --sink mcap:FILE` where FILE exists."""
         path, results = tmp_path / "out.jsonl", make_results(1)
         first = open_sink(f"jsonl:{path}", CONTRACT, fake_source())

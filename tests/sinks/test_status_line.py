@@ -108,7 +108,7 @@ class TestStatus:
         sink.write(replace(runtime.push(make_scan(0, press_counts=3000)), **changes), {})
         assert (sink.line() + " ").startswith(line) and sink.line().isascii()
 
-    def test_silence_is_shown_and_the_line_ten_times_a_second_at_most(self, monkeypatch):
+    def test_the_line_shows_silence_at_most_ten_times_a_second(self, monkeypatch):
         monkeypatch.setenv("COLUMNS", "200")
         sink, (first, other) = self.make(), make_results(1)
         for _ in range(101):
