@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from firmware_bridge.errors import RecordingError
+from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.recording.tracks import Recording
 
 
@@ -26,6 +26,8 @@ def load_recording(path: str | Path) -> Recording:
             raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap")
     try:
         recording = reader(path)
+    except NpzError as error:
+        raise RecordingError(f"{path}: {error}") from error
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     if recording.origin != "emulated":
