@@ -33,10 +33,7 @@ def check_poses(text: str) -> tuple[str | None, str]:
 
 
 def open_poses(text: str, queue: PoseQueue) -> "PoseSource":
-    """Open the source of poses that `text` names, as for `check_poses`; they go to the queue.
-
-    Raises a UsageError where Cyclone DDS is not installed, and a SinkError where its domain cannot be joined.
-    """
+    """Open the source of poses that `text` names, as for `check_poses`; they go to the queue."""
     sensor, topic = check_poses(text)
     with needs_cyclone_dds(text):
         return PoseSource(topic, queue, sensor)

@@ -1,7 +1,4 @@
-"""Users' files: written by a draft that is moved in place once it is complete, and read up to a limit.
-
-The former file is kept. The limit is there since a path can also lead to an endless device.
-"""
+"""Users' files: written by a draft that is moved in place once it is complete, and read up to a limit."""
 
 import errno
 import os
@@ -20,11 +17,8 @@ def write_in_place(
     """Write a file so that at any time its name leads to a complete file, new or former, or to no file.
 
     `write` writes a draft of the same name in another folder, and `load` reads it back, as its readers will. An
-    existing file stays as NAME.bak, unless not `keep_before`, for files that are rewritten often.
-
-    Raises:
-        OSError: the file cannot be written, or is no plain file. Errors of `write` and `load` are passed on. The former
-            file is still there.
+    existing file stays as NAME.bak, unless not `keep_before`, for files that are rewritten often. Raises an OSError
+    where it cannot be written, and errors of `write` and `load`; then the former file is still there.
     """
     path = Path(path)
     check_writable(path)
@@ -55,11 +49,7 @@ def check_writable(path: Path) -> None:
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """Read a whole file.
-
-    Raises:
-        OSError: it cannot be read, or is larger; no more than a mebibyte beyond the limit is read.
-    """
+    """Read a whole file, or raise an OSError where it is larger, as an endless device is."""
     content = bytearray()
     with path.open("rb") as file:
         while piece := file.read(1 << 20):  # one large read would allocate memory for the whole limit

@@ -19,24 +19,13 @@ MOST: Final = 1e6
 
 @dataclass(frozen=True, slots=True)
 class PadPose:
-    """Pose of a pad's centre in the object's plane.
-
-    Attributes:
-        x_mm: place along x.
-        y_mm: place along y.
-        turn_deg: turn from x to y.
-        error_mm: standard deviation of the place, along x and along y.
-        error_deg: standard deviation of the turn.
-
-    Raises:
-        ValueError: a number is not finite or out of range, or an error is negative.
-    """
+    """Pose of a pad's centre in the object's plane; a ValueError for a number that is not finite or out of range."""
 
     x_mm: float
     y_mm: float
-    turn_deg: float = 0.0
-    error_mm: float = PLACE_ERROR_MM
-    error_deg: float = TURN_ERROR_DEG
+    turn_deg: float = 0.0  # from x to y
+    error_mm: float = PLACE_ERROR_MM  # standard deviation of the place, along x and along y
+    error_deg: float = TURN_ERROR_DEG  # standard deviation of the turn
 
     def __post_init__(self) -> None:
         for name, low in (("x_mm", -MOST), ("y_mm", -MOST), ("turn_deg", -MOST), ("error_mm", 0), ("error_deg", 0)):
@@ -150,21 +139,13 @@ class PoseTrack:
 
 @dataclass(frozen=True, slots=True)
 class TimedPose:
-    """A pose with its time.
-
-    Attributes:
-        pose: pose of the pad in the object's plane.
-        time_ns: monotonic time of the pose, in [ns].
-        sensor: name of the sensor; None for every sensor without poses of its own.
-        holds: the pad rests there until the next pose.
-        used_from_ns: time of the first scan that was made with it at hand, in [ns]: a pose arrives later than its own
-            time, and a replay must not use it earlier. None if it is not available.
-    """
+    """A pose with its monotonic time."""
 
     pose: PadPose
     time_ns: int
-    sensor: str | None = None
-    holds: bool = False
+    sensor: str | None = None  # None for every sensor without poses of its own
+    holds: bool = False  # the pad rests there until the next pose
+    # Time of the first scan that was made with it at hand: it arrives after its own time, and a replay must wait, too.
     used_from_ns: int | None = None
 
     def later(self, by_ns: int) -> "TimedPose":

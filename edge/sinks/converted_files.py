@@ -2,7 +2,6 @@
 
 import csv
 import json
-import shutil
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -51,9 +50,7 @@ _ELSEWHERE: Final = {"scan_pose": ("pose",), "centre_of_pressure_mm": ("wrench",
 def write_npz(path: Path, recording: Recording) -> None:
     """Write arrays with a row for each scan of an .mcap; what a row lacks is unknown there.
 
-    Raises:
-        RecordingError: a result or a map cannot be read.
-        SinkError: patterns change their size.
+    Raises a RecordingError where a result cannot be read, a SinkError where patterns change their size.
     """
     with ExitStack() as opened:
         columns = _Columns(path.parent, opened)
@@ -99,11 +96,8 @@ class _Columns:
     def add_to(self, archive: zipfile.ZipFile) -> None:
         for name in sorted(self._columns, key=lambda name: name != "origin"):  # first: what loses its end has it
             file, dtype, shape, _ = self._columns[name]
-            file.seek(0)
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                header = {"descr": dtype.str, "fortran_order": False, "shape": (self._rows, *shape)}
-                npy.write_array_header_1_0(entry, header)
-                shutil.copyfileobj(file, entry, 1 << 20)
+            file.flush()
+            _add(archive, name, np.memmap(file, dtype, "r", shape=(self._rows, *shape)))
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:
@@ -203,7 +197,7 @@ class _Rows:
 
 
 def _value(field: Field, record: Mapping[str, Any], taps: int) -> Any:
-    """Return the value of a field in a record, as an array holds it."""
+    """Return a field of a record, as an array holds it."""
     value: Any = record
     for key in _ELSEWHERE.get(field.name, (field.name,)):
         value = None if value is None else value.get(key)

@@ -1,11 +1,7 @@
 """Record of a result, or of an event, for every sink that writes them: as a line of JSON, and as a binary message.
 
-A line is flushed as it is written, since a robot reads it live. A message, as the live page and zenoh carry it, has a
-header whose "maps" lists them: [[name, [size, ...]], ...].
-
-    4 bytes     n, length of the header, little-endian
-    n bytes     header, JSON in UTF-8, padded with spaces until 4 + n is a multiple of 4
-    the rest    maps, float32 little-endian in C order, one after the other
+A line is flushed as it is written, since a robot reads it live. docs/middleware.md has the layout of a message, as the
+live page and zenoh carry it.
 """
 
 import errno
@@ -143,7 +139,6 @@ def pack(header: Mapping[str, Any], maps: Mapping[str, NDArray[np.floating]]) ->
 
 
 PIPE_BYTES: Final = 1 << 20  # most that Linux gives to any user
-_WITH_MAPS: Final = RecordForm(maps=True)
 _ON_A_LINE: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 _BEGINNING: Final = b'{"time_ns":'  # of every record: a recording, or a sensor file, must not become one by a slip
 
@@ -168,7 +163,7 @@ class JsonLinesSink(Sink):
         self._target = "stdout" if target == "-" else target
         self._source, self._stop, self._waits = source.kind, stop or threading.Event(), source.kind == "replay"
         names = None if fields is None else chosen_fields(fields)
-        self._form = _WITH_MAPS if names is None else RecordForm(names, maps=True)
+        self._form = RecordForm(names, maps=True)
         self._contract = contract if CONTACTS in (names or ()) else None
         self.unwritten = 0
         self._turns = CountersInTurn()
@@ -222,11 +217,6 @@ class JsonLinesSink(Sink):
         """Close the file. Every record is on its way already."""
         with suppress(OSError):
             self._file.close()
-
-
-def record_line(result: Result, counters: Mapping[str, int] | None) -> bytes:
-    """Return a result as one line of JSON, its maps last."""
-    return orjson.dumps(_WITH_MAPS.of(result, counters), option=_ON_A_LINE)
 
 
 def _contacts(result: Result, contract: Contract) -> list[dict[str, Any]]:

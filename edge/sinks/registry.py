@@ -27,15 +27,11 @@ _UNWRITTEN: Final = attrgetter("unwritten")
 
 
 class Fan(Sink):
-    """Fan-out of results and events to several sinks.
-
-    Attributes:
-        failures: of sinks given up, in their order.
-    """
+    """Fan-out of results and events to several sinks; the failure of the last one ends the run."""
 
     def __init__(self, tell: Callable[[Event], object], clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         """Begin without a sink; `tell` is called first with the event of one that is given up or reports trouble."""
-        self.failures: list[SinkError] = []
+        self.failures: list[SinkError] = []  # of sinks given up
         self._sinks: list[Sink] = []
         self._given_up_unwritten = 0
         self._counters: Mapping[str, int] = {}  # the newest, also for a sink that fails while no scan comes
@@ -45,7 +41,7 @@ class Fan(Sink):
         self._known_trouble: set[str] = set()
 
     def add(self, sink: Sink) -> None:
-        """Add one open sink; the failure of the last sink ends the run."""
+        """Add one open sink."""
         self._sinks.append(sink)
 
     @property
@@ -122,11 +118,10 @@ class Fan(Sink):
 
 
 class Form(NamedTuple):
-    """Form of a sink: as a user writes it, what it is, and the check of its target."""
+    """Form of a sink: as a user writes it, and what it is."""
 
     text: str
     about: str
-    check: Callable[[str], object] = str
 
 
 def check_sink(text: str) -> tuple[str, str]:
@@ -140,7 +135,19 @@ def check_sink(text: str) -> tuple[str, str]:
         raise UsageError(f"no sink {text!r}: record by --sink {as_typed(f'mcap:{made}')}, then {then}")
     if form is None or (text != name if form.text == name else not target):
         raise UsageError(f"no sink {text!r}; sinks are {', '.join(form.text for form in FORMS.values())}")
-    form.check(target)
+    match name:
+        case "mcap" if not target.endswith(".mcap"):
+            raise UsageError(f"sink {text!r} names {target!r}, expected a file whose name ends in .mcap")
+        case "zenoh":
+            from edge.sinks.zenoh import parsed_target
+
+            parsed_target(target)
+        case "rerun":
+            from edge.sinks.rerun import check_target
+
+            check_target(target)
+        case "ros2":
+            _ros2_topic(target)
     return name, target
 
 
@@ -166,18 +173,10 @@ def open_sink(
 ) -> Sink:
     """Open a sink of results, as `edge-sr --sink` names it; close it after the last result is written.
 
-    Args:
-        text: "jsonl:FILE", "mcap:FILE.mcap", ...
-        contract: contract of the model that makes the results.
-        source: open source of the scans. Readers that are too slow miss records of a sensor, but never of a recording.
-        stop: set when the run is to end: then the sink no longer waits for readers of a recording's records either.
-        commands: those of the stream, for "ros2:TOPIC?commands", which takes zeroing and reset from the robot.
-        fields: those of JSON records, such as "force_n,pattern"; None for all.
-
-    Raises:
-        UsageError: the form does not exist (the message lists the forms), a field does not, or the source is not open;
-            a sink in metres for patterns of an unknown unit; a package is not installed.
-        SinkError: it cannot be opened.
+    `contract` is that of the model, `source` the open source of the scans: readers that are too slow miss records of a
+    sensor, but never of a recording, unless `stop` is set. "ros2:TOPIC?commands" gives `commands`, those of the stream,
+    zeroing and reset from the robot. `fields` of JSON records, such as "force_n,pattern", are all by default. Raises a
+    UsageError where the form or a field does not exist or a package is missing, a SinkError where it cannot be opened.
     """
     name, target = check_sink(text)
     check_kind("contract", contract, "output_unit", "that of the model, as load_model(...).contract")
@@ -219,23 +218,6 @@ def open_sink(
             raise AssertionError(f"FORMS has {name}, which nothing opens")
 
 
-def _check_mcap(target: str) -> None:
-    if not target.endswith(".mcap"):
-        raise UsageError(f"sink 'mcap:{target}' names {target!r}, expected a file whose name ends in .mcap")
-
-
-def _check_zenoh(target: str) -> None:
-    from edge.sinks.zenoh import parsed_target
-
-    parsed_target(target)
-
-
-def _check_rerun(target: str) -> None:
-    from edge.sinks.rerun import check_target
-
-    check_target(target)
-
-
 def _ros2_topic(target: str) -> tuple[str, bool]:
     """Return the topic of a target, and whether commands are accepted."""
     from edge.sinks.ros2.messages import base_topic  # no other sink needs the messages of ROS
@@ -261,13 +243,11 @@ FORMS: Final = {
     "status": Form("status", "one live line (default on a terminal)"),
     "jsonl": Form("jsonl:FILE", "one JSON record a line; jsonl:- is stdout"),
     "mcap": Form(
-        "mcap:FILE.mcap",
-        "recording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it",
-        _check_mcap,
+        "mcap:FILE.mcap", "recording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it"
     ),
     "shm": Form("shm:NAME", "latest values in shared memory"),
-    "zenoh": Form("zenoh:KEY", "messages over zenoh; to a router with ?connect=tcp/HOST:7447", _check_zenoh),
-    "ros2": Form("ros2:TOPIC", "ROS 2 messages", _ros2_topic),
-    "rerun": Form("rerun:view", "a Rerun viewer; one that is open by HOST:PORT; FILE.rrd", _check_rerun),
+    "zenoh": Form("zenoh:KEY", "messages over zenoh; to a router with ?connect=tcp/HOST:7447"),
+    "ros2": Form("ros2:TOPIC", "ROS 2 messages"),
+    "rerun": Form("rerun:view", "a Rerun viewer; one that is open by HOST:PORT; FILE.rrd"),
 }
 """Forms of sinks by their names, in the order of the help."""

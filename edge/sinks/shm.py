@@ -128,8 +128,6 @@ class SharedMemorySink(Sink):
         """Make the segment; one that a crash left over is replaced."""
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", name):
             raise SinkError(f"shm:{name} cannot be a name: expected letters, digits, '_', '.' and '-', 100 at most")
-        if not FOLDER.is_dir():
-            raise SinkError(f"no {FOLDER} here: shm: needs Linux")
         self._path = FOLDER / name
         self._layout = Layout(contract.rows, contract.cols, *contract.pattern_shape, contract.traction_shape)
         try:

@@ -38,11 +38,7 @@ CLOSED: Final = {
 
 
 class ZenohSink(Sink):
-    """Publisher of KEY/SENSOR/scan, KEY/SENSOR/pattern and KEY/event, alive as KEY/alive/ID.
-
-    Attributes:
-        zid: the session's id, which the time stamp of every message holds, too.
-    """
+    """Publisher of KEY/SENSOR/scan, KEY/SENSOR/pattern and KEY/event, alive as KEY/alive/ID."""
 
     def __init__(self, target: str, source: Source) -> None:
         """Open a session; it does not matter whether a subscriber is there, now or later."""
@@ -52,14 +48,13 @@ class ZenohSink(Sink):
             import zenoh
         except ImportError as error:
             raise SinkError(f"zenoh: needs eclipse-zenoh: {how_to_install('zenoh')}") from error
-        with opening():
-            self._session = zenoh.open(_configured(configuration))
         self._failure = zenoh.ZError
         self._turns = CountersInTurn()
         congestion = zenoh.CongestionControl
         self._congestion = congestion.BLOCK if source.kind == "replay" else congestion.DROP
         with opening():
-            self.zid = str(self._session.zid())
+            self._session = zenoh.open(_configured(configuration))
+            self.zid = str(self._session.zid())  # which the time stamp of every message holds, too
             self._events = self._publisher(f"{self._key}/event", "application/json")
             self._read = True  # until a result shows that there is no subscriber
             self._alive = self._session.liveliness().declare_token(f"{self._key}/alive/{self.zid}")

@@ -2,10 +2,8 @@
 
 A browser runs pages of strangers, which can reach a server on loopback, too. Three things keep them out: the name that
 the browser was asked to reach (a stranger's name may resolve to this machine), the origin of the page that opens a
-socket, and, where other machines can reach the server, a token.
-
-A proxy may ask under its own name for this server, so that the origin of our page differs from the name: such a page
-needs the token, which no stranger knows.
+socket, and, where other machines can reach the server, a token. Behind a proxy the origin of our page differs from the
+name: such a page needs the token, too.
 """
 
 import hmac
@@ -13,11 +11,9 @@ import ipaddress
 import re
 import secrets
 import socket
-import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from fcntl import ioctl
 from http import HTTPStatus
 from typing import Final
 from urllib.parse import parse_qs
@@ -32,15 +28,11 @@ _HOST: Final = re.compile(r"(?:\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[\w.-]+)
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Conditions that a request must meet.
+    """Conditions that a request must meet."""
 
-    The server listens at `host`, a name or an address; `name` is that of this machine, with or without a domain. The
-    token is None where it is not needed.
-    """
-
-    host: str
-    name: str
-    token: str | None
+    host: str  # name or address at which the server listens
+    name: str  # of this machine, with or without a domain
+    token: str | None  # None where it is not needed
 
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> tuple[HTTPStatus, str] | None:
         """Return status and reason with which a request is refused; None if it is granted.
@@ -56,7 +48,8 @@ class Access:
         given = parse_qs(query)
         # A browser sends no origin when a page asks why its socket was refused, so that the page names its own.
         origins = [*origins, *given.get("origin", [])]
-        trusted = self.token is not None and _same(given.get("token", [""])[-1], self.token)
+        token = given.get("token", [""])[-1].encode(errors="surrogatepass")
+        trusted = self.token is not None and hmac.compare_digest(token, self.token.encode())
         for origin in origins:
             if origin != f"http://{hosts[0]}" and not (place == SOCKET and trusted):
                 text = f"pages of {', '.join(origins)} may not send requests to this server"
@@ -72,10 +65,7 @@ class Access:
         return None
 
     def urls(self, port: int, addresses: Sequence[str] = ()) -> list[str]:
-        """Return the addresses of the page, the most useful first.
-
-        Where the server listens at all `addresses` of this machine, its name is the last: others may not know it.
-        """
+        """Return the addresses of the page; this machine's name is the last, since others may not know it."""
         hosts = [*addresses, self.name] if is_everything(self.host) else [self.host]
         query = "" if self.token is None else f"?token={self.token}"
         return [f"http://{f'[{host}]' if ':' in host else host}:{port}{PAGE}{query}" for host in hosts]
@@ -128,21 +118,9 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return None
 
 
-def _same(given: str, token: str) -> bool:
-    return hmac.compare_digest(given.encode(errors="surrogatepass"), token.encode())
-
-
-_REQUEST: Final = struct.Struct("16s4x4s232x")
-"""The kernel's `ifreq` with an IPv4 address: name of the interface, family and port, address; room for other uses."""
-
-
 def own_addresses() -> list[str]:
-    """Return the IPv4 addresses of this machine at which others on its networks reach it."""
-    addresses: list[str] = []
+    """Return the IPv4 address at which others reach this machine, of the network that leads elsewhere, if any does."""
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        for _, name in socket.if_nameindex():
-            with suppress(OSError):  # SIOCGIFADDR of an interface without an IPv4 address
-                answer = ioctl(asked, 0x8915, _REQUEST.pack(name.encode(), bytes(4)))
-                addresses.append(socket.inet_ntoa(_REQUEST.unpack(answer)[1]))
-    usable = (ip for ip in map(ipaddress.ip_address, addresses) if not (ip.is_loopback or ip.is_link_local))
-    return list(dict.fromkeys(map(str, usable)))
+        asked.connect(("192.0.2.1", 9))  # of documentation; nothing is sent
+        return [asked.getsockname()[0]]
+    return []

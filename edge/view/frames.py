@@ -37,7 +37,7 @@ MOST_VIEWERS: Final = 8
 LATE_S: Final = 0.5
 """Age of an unanswered ping, in [s], from which nothing more is sent: the frames on their way are old already."""
 _PERIOD_NS: Final = round(1e9 / MAX_FPS)
-Truth = Callable[[Result], NDArray[np.float32] | None]
+Truth = Callable[[Result], NDArray[np.float32] | None]  # true pattern (H, W) of a result, where a simulation states it
 
 
 class Point(NamedTuple):
@@ -64,19 +64,13 @@ class Newest(NamedTuple):
 class RunSnapshot(Sink):
     """Newest result and trace of every sensor, and the latest events, in memory that does not grow with the run.
 
-    Attributes:
-        sensors: their traces by name.
-        first_ns: time of the run's first scan, in [ns]; None before.
-        map: newest state of the map; None where none is made.
-        truth_of: the true pattern of a result, (H, W) in its unit, where the simulation states one; else None.
-        wake: called when there is something to show, MAX_FPS times a second at most; it never waits. So viewers are
-            served after a scan's last work and not by a clock of their own, while the loop sleeps.
+    After a scan's last work it calls `wake`, MAX_FPS times a second at most: viewers are served while the loop sleeps.
     """
 
     def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self.sensors: dict[str, SensorTrace] = {}
-        self.first_ns: int | None = None
-        self.map: MapState | None = None
+        self.first_ns: int | None = None  # time of the run's first scan
+        self.map: MapState | None = None  # its newest state, where one is made
         self.truth_of: Truth = lambda result: None
         self.wake: Callable[[], object] = lambda: None
         self._clock_ns = clock_ns
@@ -164,12 +158,7 @@ class SensorTrace:
 
 
 class Frames:
-    """Frames of one moment, in [ns]; viewers at the same state get the same bytes.
-
-    Attributes:
-        newest: newest result of each sensor.
-        map: state of the map; None where none is made.
-    """
+    """Frames of one moment, in [ns]; viewers at the same state get the same bytes."""
 
     def __init__(self, snapshot: RunSnapshot, now_ns: int, source: SourceKind | None) -> None:
         self._now_ns, self._source, self._snapshot = now_ns, source, snapshot
@@ -231,7 +220,6 @@ def hello(source: Source, model: str, contract: Contract) -> bytes:
     height, width = contract.pattern_shape
     header = {
         "kind": "hello",
-        "version": 1,
         "run": secrets.token_hex(8),
         "name": harmless(source.name),
         "source": source.kind,
@@ -277,14 +265,10 @@ def _seconds(ns: int) -> float:
 
 
 class Viewer:
-    """Viewer of the page; every frame holds the newest values, however long ago the frame before was sent.
-
-    Attributes:
-        pinged_s: time since which a ping is unanswered, in [s]; None while none is.
-    """
+    """Viewer of the page; every frame holds the newest values, however long ago the frame before was sent."""
 
     def __init__(self) -> None:
-        self.pinged_s: float | None = None
+        self.pinged_s: float | None = None  # time since which a ping is unanswered
         self._seen: dict[str, int] = {}
         self._sent_number = 0
         self._seen_map: MapState | None = None
@@ -320,6 +304,4 @@ def execute(message: str | bytes, commands: Commands) -> str | None:
     commands.refuse()
     if command is not None:
         return f"{WAITING} commands are waiting: repeat it when the run has executed them"
-    shown = repr(message[:60])
-    shown = shown if len(message) <= 60 else f"{shown[:-1]}...{shown[-1]}"
-    return f"{shown} is not a command: expected {FORMS}"
+    return f"{message[:60]!r} is not a command: expected {FORMS}"

@@ -1,12 +1,8 @@
-"""Server of the live page: one thread, which sleeps until there is something to send and a viewer to send it to.
-
-Each of its steps is short, since the loop cannot run meanwhile: it packs a frame, and sends it.
-"""
+"""Server of the live page: one thread, whose steps are short, since the loop cannot run meanwhile."""
 
 import asyncio
 import base64
 import contextlib
-import errno
 import gc
 import hashlib
 import socket
@@ -77,8 +73,7 @@ def _policy(script: bytes) -> str:
 LOOPBACK: Final = "127.0.0.1"
 STATE_S: Final = 1.0
 OPEN_S: Final = 5.0
-GONE_S: Final = 10.0
-"""Longest time for which a viewer reads nothing until it is disconnected, in [s]."""
+GONE_S: Final = 10.0  # longest time for which a viewer reads nothing until it is disconnected
 TIDY_CONNECTIONS: Final = 64
 
 
@@ -106,19 +101,12 @@ class Connection(ServerConnection):
 
 
 class LiveView:
-    """Live page of a run; the port is taken at once, and pages are answered from `begin` on.
-
-    Attributes:
-        sinks: sinks that the loop writes to; they never fail.
-        url: the page's address.
-        other_urls: more addresses of it, where it listens at all addresses of this machine.
-    """
+    """Live page of a run; the port is taken at once, and pages are answered from `begin` on."""
 
     def __init__(self, host: str, port: int, token: str | None, contract: Contract, commands: Commands) -> None:
-        """Take the port, 0 for any free one, where `host` leads.
+        """Take the port, 0 for any free one; without a token one is made where other machines can reach `host`.
 
-        Requests must carry the token; None makes one where other machines can reach `host`. Raises UsageError where the
-        token is not valid, SinkError where the port cannot be taken.
+        Raises a UsageError for a token that cannot be one, a SinkError where the port cannot be taken.
         """
         self._access = grant(host, socket.gethostname(), token)
         self._contract, self._commands = contract, commands
@@ -134,7 +122,7 @@ class LiveView:
         self._looked_at = threading.Event()
         self._snapshot = RunSnapshot()
         self._snapshot.wake = self._wake_if_watched
-        self.sinks: list[Sink] = [self._snapshot]
+        self.sinks: list[Sink] = [self._snapshot]  # which the loop writes to; they never fail
         addresses = own_addresses() if is_everything(host) and ":" not in host else []
         self.url, *self.other_urls = self._access.urls(self._socket.getsockname()[1], addresses)
 
@@ -158,8 +146,7 @@ class LiveView:
     ) -> None:
         """Answer requests from now on, about an open source and the model that the run begins with.
 
-        `messages` is called with an event if the page ends early, from the page's thread, and `looked_at` is set with
-        the first viewer.
+        If the page ends early its thread calls `messages`; `looked_at` is set with the first viewer.
         """
         self._messages, self._source = messages, source.kind
         self._looked_at = looked_at or self._looked_at
@@ -292,10 +279,6 @@ def listen(host: str, port: int) -> socket.socket:
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening
     except OSError as error:
-        what, remedy = f"cannot listen on {host}:{port}: {error.strerror}", "name another port with --view"
-        if error.errno == errno.EADDRINUSE:
-            what = f"cannot listen on {host}:{port}: address in use"
-            remedy = "name another port with --view, or 0 for any free one"
-        elif isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-            what, remedy = f"{host} is not an address of this machine", "name one with --view-host, or leave it out"
-        raise SinkError(f"no live page: {what}; {remedy}") from error
+        remedy = "name another port with --view, 0 for any free one, or an address of this machine with --view-host"
+        why = str(error.strerror).partition(" (while")[0]  # Python adds the address again
+        raise SinkError(f"no live page: cannot listen on {host}:{port}: {why}; {remedy}") from error

@@ -28,8 +28,8 @@ _RULE: Final = "=" * 80
 class Field(NamedTuple):
     """One field: a number, a text, or a message."""
 
-    name: str  # name of the field
-    kind: str  # name of its kind, such as "uint8", "string" or "std_msgs/Header"
+    name: str
+    kind: str  # such as "uint8", "string" or "std_msgs/Header"
     number: struct.Struct | None = None  # encoding of a number, else None
     dtype: np.dtype[Any] | None = None  # type of the numbers in an array, else None
     length: int | None = None  # length of an array, 0 if it is variable; None for a single value
@@ -40,11 +40,7 @@ class MessageType:
     """Type of a message: its name, such as "std_msgs/msg/Header", its fields, and its encoding as bytes."""
 
     def __init__(self, name: str, text: str, *parts: "MessageType") -> None:
-        """Read the text of a .msg file, without constants and defaults; `parts` are the messages in it.
-
-        Raises:
-            ValueError: a line is no such field.
-        """
+        """Read the text of a .msg file, or raise a ValueError, as for defaults; `parts` are the messages in it."""
         self.name = name
         self._text = text.strip()
         self._parts = tuple(dict.fromkeys(nested for part in parts for nested in (part, *part._parts)))
@@ -75,11 +71,7 @@ class MessageType:
         return HEADER + out
 
     def decode(self, data: bytes) -> dict[str, Any]:
-        """Decode the fields of a message; arrays of numbers as flat read-only arrays.
-
-        Raises:
-            CdrError: the bytes are no message of this type.
-        """
+        """Decode the fields of a message, or raise a CdrError; arrays of numbers are flat and read-only."""
         if bytes(data[: len(HEADER)]) != HEADER:
             raise CdrError(f"a {self.name} begins with {bytes(data[:4]).hex()}, expected {HEADER.hex()}")
         body = memoryview(data)[len(HEADER) :]

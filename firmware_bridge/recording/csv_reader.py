@@ -146,10 +146,7 @@ def load_csv(path: Path) -> Recording:
 
 
 class _Scans:
-    """Scans of the rows so far, in columns: a list of rows would take ten times the memory of the file.
-
-    A ValueError states what was got of a line, and what was expected.
-    """
+    """Scans of the rows so far, in columns: a list of rows would take ten times the memory of the file."""
 
     def __init__(self, header: Sequence[str]) -> None:
         """Sort the columns by their names."""
@@ -221,12 +218,10 @@ class _Scans:
         paces = [_pace_of(self._time_names[column], times) for column, times in self._times.items()]
         pace = next((pace for pace in paces if pace.rate_hz is not None), paces[0] if paces else None)
         if pace is not None:
-            notes.append(f"{path}: {_listed(self._time_names.values())} left out as times, which give {pace}")
+            notes.append(f"{path}: left out as times, which give {pace}: {_listed(self._time_names.values())}")
         if self._left_out:
-            notes.append(
-                f"{path}: {_listed(self._left_out)} left out as none of a taxel, a time or a pose; if one is, rename "
-                "it, such as txl1_x, time_s, pose_x_mm"
-            )
+            why = "none of a taxel, a time or a pose; if one is, rename it, such as txl1_x, time_s, pose_x_mm"
+            notes.append(f"{path}: left out as {why}: {_listed(self._left_out)}")
         vendor = None
         if self._newtons:
             newtons = _by_axis(np.frombuffer(self._newtons, np.float32), self._pad)
@@ -342,7 +337,6 @@ def _meta_rate_hz(path: Path) -> float | None:
 
 
 def _listed(names: Iterable[str]) -> str:
-    """Return "column a is" or "columns a, b are", with the names of a few."""
+    """Return the names of a few columns."""
     shown = [repr(name[:30]) for name in names]
-    text = ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "")
-    return f"column {text} is" if len(shown) == 1 else f"columns {text} are"
+    return ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "")

@@ -3,16 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
-from firmware_bridge.errors import RecordingError
+from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.recording.tracks import Recording
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format.
-
-    Raises:
-        RecordingError: the file cannot be read, is no recording, or a value in it is impossible.
-    """
+    """Read a recording in the format of its name's ending, or raise a RecordingError."""
     path = Path(path)
     if path.is_dir():
         there = sorted(file.name for file in path.glob("*") if file.suffix in (".mcap", ".npz", ".csv"))[:5]
@@ -30,6 +26,8 @@ def load_recording(path: str | Path) -> Recording:
             raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap")
     try:
         recording = reader(path)
+    except NpzError as error:
+        raise RecordingError(f"{path}: {error}") from error
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     if recording.origin != "emulated":

@@ -110,7 +110,7 @@ class _Reading:
         self._origin: Literal["device", "emulated"] | None = None
 
     def topic_of(self, channel: Channel, schema: Schema | None) -> tuple[str, MessageType] | None:
-        """Return the name of a topic and the type of its messages, None for one that is not of edge-sr."""
+        """Return the name of a topic and the type of its messages; None for one that is not of edge-sr."""
         kind = None if schema is None or channel.message_encoding != "cdr" else self._kind_of(schema)
         return kind and (channel.topic[:60], kind)
 

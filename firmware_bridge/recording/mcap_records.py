@@ -1,7 +1,7 @@
 """Messages of an MCAP file, one by one, up to the end of its data or to a damage.
 
-The public reader finds the records. A file is not trusted: records are read up to a limit, and a chunk is unpacked only
-where its frame states the size that the chunk states.
+A file is not trusted: the public reader reads records up to a limit, and a chunk is unpacked only where its frame
+states the size that the chunk states.
 """
 
 import os
@@ -36,11 +36,8 @@ def messages(
     """Yield the messages of a file up to the end of its data, those in chunks one by one, and metadata between them.
 
     A message is its topic, the time at which it was logged in [ns] since 1970, and its data. `topic_of` gives the topic
-    for a channel and its schema, None for a channel whose messages are left out.
-
-    Raises:
-        RecordingError: it is no MCAP file.
-        DamageError: a record cannot be read.
+    for a channel and its schema, None for a channel whose messages are left out. Raises a RecordingError for another
+    file, a DamageError for a record that cannot be read.
     """
     schemas: dict[int, Schema] = {}
     topics: dict[int, _Topic | None] = {}

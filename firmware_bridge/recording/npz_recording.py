@@ -18,7 +18,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from firmware_bridge.errors import CdrError, NpzError, RecordingError
+from firmware_bridge.errors import CdrError, NpzError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
 from firmware_bridge.poses import POSE_FIELDS, TimedPose
 from firmware_bridge.recording.tracks import (
@@ -46,9 +46,7 @@ _BROKEN: Final = (
 def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDArray[Any]]:
     """Read the arrays of these names that are in the file, of `most_bytes` together; others are not read.
 
-    Raises:
-        NpzError: not an archive of plain arrays of numbers and text, damaged, or larger.
-        OSError: the file cannot be read.
+    Raises an NpzError for anything but a whole archive of plain arrays of numbers and text, or a larger one.
     """
     try:
         with (
@@ -118,14 +116,7 @@ _KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "fiu":
 
 
 def load_npz(path: Path) -> Recording:
-    """Read an npz."""
-    try:
-        return _recording(path)
-    except NpzError as error:
-        raise RecordingError(f"{path}: {error}") from error
-
-
-def _recording(path: Path) -> Recording:
+    """Read an npz, or raise an NpzError without its name."""
     arrays = read_npz(path, (*_REQUIRED, *_SCANS, *_POSES, *_CONVERTED), MOST_NPZ_BYTES)
     if str(arrays.get("format", "missing")) != NPZ_FORMAT:
         got = repr(str(arrays.get("format", "missing"))[:40])

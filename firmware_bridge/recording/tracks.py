@@ -28,24 +28,15 @@ A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Scans of one sensor in a recording; what was not recorded is None.
-
-    Attributes:
-        counts: (n, 3, rows, cols) int32, ABSENT where a taxel gave no reading.
-        time_ns: (n,) int64 monotonic time of each scan in [ns], never falling.
-        numbers: (n,) int64 numbers of the scans.
-        device_time_ns: (n,) int64 device times on the clock of `time_ns`, in [ns]; -1 where the device had none.
-        renewed: (n, rows, cols) bool, True where a reading was new.
-        vendor: (n,) values of the vendor's software.
-    """
+    """Scans of one sensor in a recording; what was not recorded is None."""
 
     sensor: str
-    counts: NDArray[np.int32]
-    time_ns: NDArray[np.int64] | None
-    numbers: NDArray[np.int64] | None = None
-    device_time_ns: NDArray[np.int64] | None = None
-    renewed: NDArray[np.bool_] | None = None
-    vendor: tuple[VendorReading | None, ...] | None = None
+    counts: NDArray[np.int32]  # (n, 3, rows, cols), ABSENT where a taxel gave no reading
+    time_ns: NDArray[np.int64] | None  # (n,), monotonic, never falling
+    numbers: NDArray[np.int64] | None = None  # (n,)
+    device_time_ns: NDArray[np.int64] | None = None  # (n,) on the clock of `time_ns`; -1 where the device had none
+    renewed: NDArray[np.bool_] | None = None  # (n, rows, cols), True where a reading was new
+    vendor: tuple[VendorReading | None, ...] | None = None  # (n,)
     pad: SensorGeometry | None = None
 
     @property
@@ -63,32 +54,19 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Tracks of one file, at least one, each with at least one scan.
-
-    Attributes:
-        tracks: one per sensor, in the order in which they first occur.
-        rate_hz: rate of each sensor's scans, in [Hz]; None if the file does not state it.
-        baselines: baselines at the first scan of each sensor; without sensors that were not zeroed yet.
-        mountings: mountings of the sensors, by name. The taxels are in place; only the axes are still to be turned.
-        unix_offset_ns: offset from `time_ns` to [ns] since 1970; None if the file does not state it.
-        origin: "device" or "emulated", the origin of its scans, however often they were played and recorded again;
-            None if the file does not state it.
-        poses: poses of the pads, in the order in which they were taken.
-        poses_by_row: the times of the poses are rows of the scans, which have no times themselves.
-        pauses: (n,) time without a scan before each scan, in periods, of scans without times; None without any.
-    """
+    """Tracks of one file, at least one, each with at least one scan; what the file does not state is None."""
 
     path: Path
-    tracks: tuple[Track, ...]
-    rate_hz: float | None
-    baselines: "Mapping[str, Baseline]" = field(default_factory=dict)
-    mountings: Mapping[str, Mounting] = field(default_factory=dict)
-    unix_offset_ns: int | None = None
+    tracks: tuple[Track, ...]  # one per sensor, in the order in which they first occur
+    rate_hz: float | None  # of each sensor's scans
+    baselines: "Mapping[str, Baseline]" = field(default_factory=dict)  # at the first scan of each sensor that has one
+    mountings: Mapping[str, Mounting] = field(default_factory=dict)  # taxels are in place, axes are still to be turned
+    unix_offset_ns: int | None = None  # from `time_ns` to [ns] since 1970
     notes: tuple[str, ...] = ()
-    origin: Literal["device", "emulated"] | None = None
-    poses: Sequence[TimedPose] = ()
-    poses_by_row: bool = False
-    pauses: NDArray[np.float64] | None = None
+    origin: Literal["device", "emulated"] | None = None  # however often its scans were played and recorded again
+    poses: Sequence[TimedPose] = ()  # in the order in which they were taken
+    poses_by_row: bool = False  # times of the poses are rows of the scans, which have no times themselves
+    pauses: NDArray[np.float64] | None = None  # (n,) periods without a scan before each scan, of scans without times
 
 
 def origin_of(kinds: Iterable[str | None]) -> Literal["device", "emulated"] | None:
@@ -124,11 +102,7 @@ def mounting_text(mounting: Mounting) -> str:
 
 
 def read_mounting(text: str, taxel_count: int) -> Mounting:
-    """Return the mounting in a text of `mounting_text`.
-
-    Raises:
-        ValueError: it is none, or none of so many taxels.
-    """
+    """Return the mounting in a text of `mounting_text`; a ValueError where it is none, or none of so many taxels."""
     try:
         fields = json.loads(text)
         order, signs = tuple(fields["order"]), tuple(fields["signs"])

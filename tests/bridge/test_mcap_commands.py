@@ -63,14 +63,6 @@ def made(tmp_path_factory):
     raise AssertionError("no scan of the contact got its pattern in any of ten recordings")
 
 
-def recorded_within(most_bytes, *arguments):
-    """Return exit code and messages of a recorder that can write files so long at most, and so no bytecode."""
-    disk = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
-    process = start("record", *arguments, preexec_fn=disk, env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"})
-    _, said = process.communicate()
-    return process.returncode, said
-
-
 def replayed(made, name, *options, file="press.mcap"):
     arguments = ["replay", made / file, "--model", made / "tiny.onnx", "--sink", f"jsonl:{name}", *options]
     assert cli.main([str(one) for one in arguments]) == 0
@@ -123,13 +115,11 @@ class TestOffline:
 
 
 class TestRecord:
-    def test_it_says_what_it_recorded_and_ends_the_name_in_mcap(self, made, tmp_path, capsys):
+    def test_it_says_what_it_recorded_and_what_of_that_is_emulated(self, made, tmp_path, capsys):
         assert cli.main(["record", f"{tmp_path}/run.1", *source_of(made, 2000)]) == 0
         assert len(load_recording(tmp_path / "run.1.mcap").tracks[0].counts) == 160
         said = capsys.readouterr().err.splitlines()[-1]
         assert f"recorded {tmp_path}/run.1.mcap: 160 scans, 0.1 s, " in said and "EMULATED" not in said
-
-    def test_a_copy_of_what_is_emulated_is_called_so_in_its_summary(self, made, tmp_path, capsys):
         scans = [make_scan(number, noise=3) for number in range(5)]
         path = record_into(tmp_path / "first.mcap", make_results(scans, source="emulated"))
         model = ["--model", f"{made}/tiny.onnx"]
@@ -147,9 +137,7 @@ class TestRecord:
             ("none/x", 5, "No such file or directory"),
         ],
     )
-    def test_where_nothing_can_be_recorded_one_line_says_so(
-        self, made, tmp_path, monkeypatch, capsys, name, code, words
-    ):
+    def test_where_nothing_can_be_recorded_it_says_so(self, made, tmp_path, monkeypatch, capsys, name, code, words):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "taken").mkdir()
         (tmp_path / "old.mcap").write_text("old")
@@ -172,17 +160,16 @@ class TestRecord:
         assert (recording.tracks[0].counts == np.stack([scan.counts for scan in seen])).all()
         assert f"{path} breaks off (after byte " in recording.notes[0]
 
-    def test_of_a_full_disk_no_more_scans_are_claimed_than_are_sure(self, made, tmp_path):
+    @pytest.mark.parametrize("most_bytes", [40_000, 4000])
+    def test_of_a_full_disk_no_more_scans_are_claimed_than_are_sure(self, made, tmp_path, most_bytes):
+        """Without room for one scan no file is left."""
         path = tmp_path / "full.mcap"
-        code, said = recorded_within(40_000, path, *source_of(made, 60))
-        assert code == 5 and f"recorded {path}: at most " in said
-        assert f"recording into {path} stopped: File too large; its " in said.splitlines()[-1]
-
-    def test_a_disk_without_room_for_one_scan_leaves_no_file(self, made, tmp_path):
-        path = tmp_path / "full.mcap"
-        code, said = recorded_within(4000, path, *source_of(made, 60))
-        assert code == 5 and "File too large" in said.splitlines()[-1] and not path.exists()
-        assert "can be played" not in said and f"recorded {path}" not in said
+        disk = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+        environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+        process = start("record", path, *source_of(made, 60), preexec_fn=disk, env=environment)
+        said, some = process.communicate()[1], most_bytes == 40_000
+        assert process.returncode == 5 and f"recording into {path} stopped: File too large; " in said.splitlines()[-1]
+        assert (path.exists(), f"recorded {path}: at most " in said, "can be played" in said) == (some, some, some)
 
 
 def test_what_the_page_says_of_reading_it_works(tmp_path, monkeypatch, capsys):

@@ -5,13 +5,13 @@ import json
 import threading
 import time
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path, PosixPath
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, ROOT, FakeModel, fake_source, make_contract, make_scan, make_wrench_result
+from edge_samples import BASELINE, ROOT, FakeModel, fake_source, make_scan, make_wrench_result
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_samples import (
@@ -76,12 +76,8 @@ class TestSink:
         by_topic = messages_of(path)
         for sensor, topic in (("4", "/s4"), ("left/6", "/left/s6")):
             own = [result for result in results if result.scan.sensor == sensor]
-            times = [result.scan.time_ns + OFFSET_NS for result in own]
-            assert [at for at, _ in by_topic[f"{topic}/scan"]] == times
-            assert all(
-                (decode_scan(data).counts == one.scan.counts).all()
-                for (_, data), one in zip(by_topic[f"{topic}/scan"], own, strict=True)
-            )
+            for (at, data), one in zip(by_topic[f"{topic}/scan"], own, strict=True):
+                assert at == one.scan.time_ns + OFFSET_NS and (decode_scan(data).counts == one.scan.counts).all()
             for name in ("pattern", "deviation"):
                 maps = [recorded_map(data).tobytes() for _, data in by_topic[f"{topic}/{name}"]]
                 made = [in_si(name, getattr(one, name)).tobytes() for one in own if one.pattern is not None]
@@ -194,6 +190,9 @@ class TestReplay:
 # In other people's programs: public readers, and the layouts of viewers.
 
 
+FRAMES = {"4": PadFrame("tool0", (0, 0, 50.5))}
+
+
 def decoded(path):
     """Return the last message and the metadata of each topic, by the definitions in the file alone."""
     with path.open("rb") as file:
@@ -204,15 +203,9 @@ def decoded(path):
 def test_public_readers_find_units_frames_and_marks(tmp_path):
     """By the definitions in the file alone, as Foxglove and Rerun read it."""
     results = [replace(one, source="emulated") for one in make_results(odd_scans())]
-    path = tmp_path / "press.mcap"
-    sink = McapSink(
-        path, make_contract(), fake_source(unix_offset_ns=OFFSET_NS, frames={"4": PadFrame("tool0", (0, 0, 50.5))})
-    )
-    for result in results:
-        scan = replace(result.scan, device_ns=result.scan.time_ns - 2_000_000)
-        sink.write(replace(result, scan=scan), {})
-    sink.close()
-    found = decoded(path)
+    scans = [replace(one.scan, device_ns=one.scan.time_ns - 2_000_000) for one in results]
+    results = [replace(one, scan=scan) for one, scan in zip(results, scans, strict=True)]
+    found = decoded(record_into(tmp_path / "press.mcap", results, frames=FRAMES))
     messages = {topic: message for topic, (message, _) in found.items()}
     units = [found[topic][1].get("unit") for topic in ("/s4/pattern", "/left/s6/deviation", "/s4/scan")]
     assert units == ["m", "m", None]
@@ -231,14 +224,12 @@ def test_public_readers_find_units_frames_and_marks(tmp_path):
     assert rows * pitch_m == pattern.column_count * pitch_m == pytest.approx(4 * 4.7e-3), "on the whole face, in metres"
     assert pattern.pose.position.x == pattern.pose.position.y == pytest.approx(-2 * 4.7e-3), "about its middle"
     stamp_ns = pattern.timestamp.sec * 10**9 + pattern.timestamp.nanosec
-    assert stamp_ns == newest.scan.time_ns - 2_000_000 + OFFSET_NS, "of arrival, though the device states a time"
+    assert stamp_ns == newest.scan.device_ns + OFFSET_NS, "of arrival, though the device states a time"
 
 
 def test_the_layout_for_foxglove_shows_what_a_recording_holds(tmp_path):
     layout = json.loads((ROOT / "examples/viewers/foxglove.json").read_text())
-    sink = McapSink(
-        tmp_path / "press.mcap", make_contract(), fake_source(frames={"4": PadFrame("tool0", (0, 0, 50.5))})
-    )
+    sink = McapSink(tmp_path / "press.mcap", SURE, fake_source(frames=FRAMES))
     result = make_wrench_result()
     sink.write(replace(result, deviation=result.pattern / 10), {})
     sink.tell(Event(time.monotonic_ns(), "note", None, "hello"), {})
@@ -304,13 +295,12 @@ def test_a_baseline_of_later_is_none_of_the_beginning(tmp_path):
     assert load_recording(record_into(tmp_path / "zeroed.mcap", results)).baselines == {}
 
 
-def scans_alone(path, to):
-    return messages_alone(path, to, topics="/s4/scan")
-
-
 @pytest.mark.parametrize(
     ("kind", "copy"),
-    [("device", Path.rename), ("emulated", Path.rename), ("emulated", messages_alone), ("emulated", scans_alone)],
+    [
+        *(("device", Path.rename), ("emulated", Path.rename), ("emulated", messages_alone)),
+        ("emulated", partial(messages_alone, topics="/s4/scan")),
+    ],
 )
 def test_an_emulated_sensor_stays_one_in_every_generation(tmp_path, kind, copy):
     path = record_into(tmp_path / "first.mcap", make_results([make_scan()], source=kind))
@@ -334,8 +324,8 @@ def test_another_pad_is_known_without_metadata(tmp_path, rows, cols):
     baseline = replace(BASELINE, counts=np.full((3, *grid), 30_000.0, np.float32))
     sink = McapSink(tmp_path / "a.mcap", SURE, fake_source(unix_offset_ns=OFFSET_NS, geometry=geometry))
     result = make_results([make_scan()])[0]
-    everything = np.ones(grid, bool)
-    scan = replace(result.scan, counts=np.full((3, *grid), 30_000, np.int32), fresh=everything, renewed=everything)
+    counts, fresh = np.full((3, *grid), 30_000, np.int32), np.ones(grid, bool)
+    scan = replace(result.scan, counts=counts, fresh=fresh, renewed=fresh)
     sink.write(replace(result, scan=scan, baseline=baseline, pattern=None), {})
     sink.close()
     recording = load_recording(messages_alone(tmp_path / "a.mcap", tmp_path / "b.mcap"))
@@ -358,22 +348,15 @@ def test_recordings_of_before_stay_readable(tmp_path):
     assert recorded.items() <= texts.items()
 
 
-def metadata_alone(path, to):
-    """Copy a recording as the first release made it: what is known of its sensors in metadata, not in messages."""
-    records = {"mounting": {"sensor": "4", "mounting": mounting_text(TURNED)}, "source": {"kind": "emulated"}}
-    return messages_alone(path, to, ("/s4/scan", "/s4/baseline"), metadata=records)
-
-
 def test_the_mounting_and_the_origin_in_metadata_are_read(turned, tmp_path):
-    recording = load_recording(metadata_alone(turned, tmp_path / "first.mcap"))
+    """As the first release made it: what is known of its sensors in metadata, not in messages."""
+    topics, text = ("/s4/scan", "/s4/baseline"), mounting_text(TURNED)
+    records = {"mounting": {"sensor": "4", "mounting": text}, "source": {"kind": "emulated"}}
+    recording = load_recording(messages_alone(turned, tmp_path / "first.mcap", topics, metadata=records))
     assert (recording.origin, dict(recording.mountings)) == ("emulated", {"4": TURNED})
     assert not any("is not in the file" in note for note in recording.notes)
-
-
-def test_gains_of_a_mounting_are_not_left_out_unseen(turned, tmp_path):
-    fields = json.loads(mounting_text(TURNED)) | {"gains": [1.0] * 47 + [0.9]}
-    records = {"mounting": {"sensor": "4", "mounting": json.dumps(fields)}}
-    gained = messages_alone(turned, tmp_path / "gained.mcap", ("/s4/scan",), metadata=records)
+    records["mounting"]["mounting"] = json.dumps(json.loads(text) | {"gains": [1.0] * 47 + [0.9]})
+    gained = messages_alone(turned, tmp_path / "gained.mcap", topics, metadata=records)
     with pytest.raises(RecordingError, match="no mounting of sensor '4': it has gains, which this release does not"):
         load_recording(gained)
 

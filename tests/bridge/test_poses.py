@@ -123,37 +123,20 @@ def record(path, poses=POSES):
     return path
 
 
-def played(path):
-    runtime = PosedRuntime()
-    with api.open_recording(path) as source:
-        stream = Stream(source, runtime)
-        assert len(list(stream)) > 0
-    return runtime.seen, stream.statistics
-
-
-def expected_order():
-    order = []
+def test_poses_are_played_at_the_scans_that_they_served_again(tmp_path):
+    """Also by a recording of a replay."""
+    expected = []
     for number, scan in enumerate(make_scans()):
-        order += [pose for pose, first in POSES if first == number]
-        order.append(scan.time_ns)
-    return order
-
-
-def test_poses_are_played_at_the_scans_that_they_served(tmp_path):
-    seen, statistics = played(record(tmp_path / "posed.mcap"))
-    assert seen == expected_order()
-    assert (statistics.poses, statistics.poses_refused) == (len(POSES), 0)
-
-
-def test_a_replay_that_is_recorded_again_is_the_same_again(tmp_path):
-    first = record(tmp_path / "first.mcap")
-    again = tmp_path / "again.mcap"
-    runtime = PosedRuntime()
-    with api.open_recording(first) as source:
-        sink = McapSink(again, FakeModel().contract, fake_source(unix_offset_ns=OFFSET_NS))
-        api.pump(source, runtime, [sink], api.Statistics())
-        sink.close()
-    assert played(again)[0] == played(first)[0] == expected_order()
+        expected += [*(pose for pose, first in POSES if first == number), scan.time_ns]
+    path = record(tmp_path / "0.mcap")
+    for again in ("1.mcap", "2.mcap"):
+        runtime, statistics = PosedRuntime(), api.Statistics()
+        with api.open_recording(path) as source:
+            path = tmp_path / again
+            sink = McapSink(path, FakeModel().contract, fake_source(unix_offset_ns=OFFSET_NS))
+            api.pump(source, runtime, [sink], statistics)
+            sink.close()
+        assert runtime.seen == expected and (statistics.poses, statistics.poses_refused) == (len(POSES), 0)
 
 
 def test_poses_of_another_program_are_interpolated_in_time(tmp_path):
@@ -206,26 +189,20 @@ class TestCsv:
         path.write_text("".join(f"{line},{more}\n" for line, more in zip(lines, [columns, *cells], strict=True)))
         return path
 
-    def poses(self, path):
-        with ReplayLink([path], paced=False) as link:
-            return [(scan.number, link.poses()) for _ in range(3) if not link.ended for scan in link.read(0.0)]
-
-    def test_each_row_has_its_pose_or_none(self, tmp_path):
-        got = self.poses(self.write(tmp_path / "finger.csv", ["1,2,3", ",,", "-4.5, 5e-1,0"]))
-        assert got == [
-            (0, [TimedPose(PadPose(1, 2, 3), 0, used_from_ns=0)]),
-            (1, []),
-            (2, [TimedPose(PadPose(-4.5, 0.5, 0), 40_000_000, used_from_ns=40_000_000)]),
+    def test_each_row_of_each_file_has_its_pose_or_none(self, tmp_path):
+        left = self.write(tmp_path / "left.csv", ["1,2,3", ",,", "-4.5, 5e-1,0"])
+        right = self.write(tmp_path / "right.csv", ["7,2", "7,2", ","], "pose_x_mm,pose_y_mm")
+        with ReplayLink([left, right], paced=False) as link:
+            read = [(link.read(0.0)[0].time_ns, link.poses()) for _ in range(6)]
+        assert [(time_ns, pose) for time_ns, taken in read for pose in taken] == [
+            (at_ns, TimedPose(pose, at_ns, sensor, used_from_ns=at_ns))
+            for at_ns, sensor, pose in (
+                (0, "left", PadPose(1, 2, 3)),
+                (0, "right", PadPose(7, 2, 0)),
+                (20_000_000, "right", PadPose(7, 2, 0)),
+                (40_000_000, "left", PadPose(-4.5, 0.5, 0)),
+            )
         ]
-        (first, *_) = self.poses(self.write(tmp_path / "finger.csv", ["1,2"] * 2, "pose_x_mm,pose_y_mm"))
-        assert [pose.pose for pose in first[1]] == [PadPose(1, 2, 0)]
-
-    def test_two_files_together_keep_their_poses_apart(self, tmp_path):
-        paths = [self.write(tmp_path / f"{name}.csv", [f"{x},0,0"] * 3) for name, x in (("left", 1), ("right", 2))]
-        with ReplayLink(paths, paced=False) as link:
-            poses = [one for _ in range(6) for _ in link.read(0.0) for one in link.poses()]
-        assert {(one.sensor, one.pose.x_mm) for one in poses} == {("left", 1.0), ("right", 2.0)}
-        assert len(poses) == 6
 
     @pytest.mark.parametrize("cells", ["1,,3", "1,x,3", "nan,0,0", "inf,0,0", "1e7,0,0"])
     def test_a_cell_that_is_no_pose_is_refused(self, tmp_path, cells):

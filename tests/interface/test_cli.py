@@ -102,7 +102,7 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, "--counts-per-newton 1e8", ["--counts-per-newton: '1e8' is not a positive number, 0.001 to 1e+06"]),
         (2, "model", ["no command 'model': did you mean models?"]),
         (2, "--source demo --view-host 0.0.0.0", ["--view-host requires --view"]),
-        (5, "--source demo --view 0 --view-host 192.0.2.1", ["192.0.2.1 is not an address of this machine; name one"]),
+        (5, "--source demo --view 0 --view-host 192.0.2.1", ["cannot listen on 192.0.2.1:0: ", "with --view-host"]),
         (2, "--source replay:none\nsuch.npz", ["none such.npz"]),
         (2, "doctor --sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
         (5, f"{MAP} {{tmp}}/kept.npz", ["exists: give another name"]),

@@ -4,6 +4,7 @@ import json
 import math
 import signal
 import time
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from ros2_samples import ENVIRONMENT, TAG, Listener, Speaker, contact, keep_publ
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
 from edge_samples import fake_source, make_contract, make_wrench_result, wait_for
+from sink_samples import every_kind
 
 from edge.api import Command, Commands, Event, patches
 from edge.sinks.registry import open_sink
@@ -195,25 +197,40 @@ def test_who_joins_late_stops_or_dies_holds_up_nobody(sink):
         assert sink.unwritten == 0
 
 
+def test_each_kind_of_result_is_told(sink):
+    published = []
+    keep_published(sink, published)
+    for result in every_kind():
+        published.clear()
+        sink.write(result, {})
+        data = [one["data"] for one in published if type(one.get("data")) in (int, str)]
+        known = {None: -1, False: 0, True: 1}[result.trusted]
+        assert data[:2] == [known, result.state] or (result.state == "dropped" and data == [])
+        frame = result.scan.sensor if result.source == "device" else f"{result.source}/{result.scan.sensor}"
+        assert {one["header"]["frame_id"] for one in published if "encoding" in one} == {frame}
+    sink.write(contact(0), {})
+    published.clear()
+    sink.write(without_pattern(contact(1), state="baseline_in_doubt", contact=None), {})
+    images = [pixels(one | {"data": bytes(one["data"]).hex()}) for one in published if one.get("height") == 40]
+    assert len(images) == 2 and np.isnan(images).all()
+
+
 def test_a_force_of_which_a_part_is_not_known_is_no_wrench(sink):
     """Controllers refuse NaN, and counts are no newtons."""
-    published = []
+    published, result = [], contact(1)
     keep_published(sink, published, WRENCH, FLOAT)
-    result = contact(1)
-    scan = replace(result.scan, vendor=VENDOR)
-
-    def told(one):
+    vendors = replace(result, scan=replace(result.scan, vendor=VENDOR), force_n=2.0)
+    for one, wrenches in (
+        (vendors, 1),
+        (replace(vendors, force_n=1.9), 0),  # x and y of another calibration than z
+        (result, 0),  # counts in place of newtons
+    ):
         published.clear()
         sink.write(one, {})
         floats = [message["data"] for message in published if "data" in message]
-        return [message for message in published if "wrench" in message], floats[list(NUMBERS).index("force_z_n")]
-
-    wrenches, force_z_n = told(replace(result, scan=scan, force_n=2.0))
-    assert len(wrenches) == 1 and force_z_n == 2.0
-    assert told(replace(result, scan=scan, force_n=1.9)) == ([], 1.9), "x and y of another calibration than z"
-    wrenches, force_z_n = told(result)
-    assert not wrenches and math.isnan(force_z_n), "counts in place of newtons"
-    assert ros_messages.force_and_torque(replace(result, scan=scan, force_n=2.0), pad_of(3, 3)) is None, "no places"
+        assert floats[list(NUMBERS).index("force_z_n")] == pytest.approx(one.force_n or math.nan, nan_ok=True)
+        assert sum("wrench" in message for message in published) == wrenches
+    assert ros_messages.force_and_torque(vendors, pad_of(3, 3)) is None, "no places"
 
 
 def test_force_torque_and_numbers_of_a_model_with_traction(sink):
@@ -285,17 +302,13 @@ def test_a_node_that_describes_types_as_fast_dds_does_is_heard():
     assert fast_dds in ros2_domain.configuration({})
     cyclone_dds = f"<Compatibility>{fast_dds.replace('1.15', '1.16')}</Compatibility>"
     there = f",<CycloneDDS><Domain>{cyclone_dds}</Domain></CycloneDDS>"
-    sink = Ros2Sink(
-        "skin", make_contract(), fake_source("device"), environment=ENVIRONMENT | {"CYCLONEDDS_URI": TAG + there}
-    )
-    try:
+    environment = ENVIRONMENT | {"CYCLONEDDS_URI": TAG + there}
+    with closing(Ros2Sink("skin", make_contract(), fake_source("device"), environment=environment)) as sink:
         talker = Talker(sink)
         with Listener({"skin/s4/pattern": IMAGE}, "signed-bytes", more=there) as listener:
             listener.until(lambda: listener.of("skin/s4/pattern"), talker)
             message = listener.of("skin/s4/pattern")[-1]
             np.testing.assert_allclose(pixels(message), talker.wrote["4", stamp_ns(message)].pattern / 1e3, rtol=1e-6)
-    finally:
-        sink.close()
 
 
 def test_a_wrench_ends_with_its_contact_and_is_never_nan():

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from edge_samples import ROOT, ended, make_pad_contract, make_wrench_result
 from shm_samples import CONTRACT, fields, heartbeat_ns, latest, make_result, name, sink, start_writer, values, writing
+from sink_samples import every_kind
 
 from edge.api import Event, SinkError
 from edge.sinks import shm
@@ -26,8 +27,6 @@ from edge.sinks.shm import HEADER, IN_MEMORY, MEMBERS, SLOTS, Layout, SharedMemo
 sys.path.append(str(ROOT / "examples"))
 import shm_read
 from shm_read import attach
-
-pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="shared memory is a folder on Linux alone")
 
 __all__ = ["name", "sink", "start_writer"]
 VERSION_1 = (
@@ -38,6 +37,15 @@ VERSION_1 = (
     "force_z_n:d torque_x_n_mm:d torque_y_n_mm:d torque_z_n_mm:d centre_of_pressure_x_mm:d centre_of_pressure_y_mm:d"
 )
 """Names and struct's characters of what programs in the field read, as version 1 was published: without gaps."""
+
+
+CHOICES = {
+    "source": ("device", "replay", "emulated"),
+    "state": ("zeroing", "incomplete", "idle", "contact", "dropped", "baseline_in_doubt"),
+    "filled": ("rest", "neighbours"),
+    "wrench_origin": ("nominal", "calibrated"),
+    "untrusted_reason": ("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"),
+}
 
 
 class TestWhatIsThere:
@@ -58,38 +66,36 @@ class TestWhatIsThere:
         assert said["run_time_us"] == pytest.approx(result.run_time_us)
         assert said["baseline_age_s"] == pytest.approx(12.34)
         assert np.isnan(said["force_n"]) and np.isnan(said["latency_us"])
-        for map_name in ("pattern", "deviation", "zeroed"):
-            np.testing.assert_array_equal(values(half, map_name), getattr(result, map_name))
         np.testing.assert_array_equal(values(half, "counts"), result.scan.counts)
 
-    def test_what_is_over_or_was_not_read_is_not_there(self, sink, name):
-        sink.write(make_result(0, press_counts=3000), {})
-        sink.write(replace(make_result(1), dead={0: "stuck", 15: "silent"}, filled="neighbours"), {})
-        sink.write(make_result(0, sensor="6", absent=(3,)), {})
-        over, zeroing = (latest(attach(name), sensor) or b"" for sensor in "46")
-        said = [fields(over)[key] for key in ("scan", "state", "contact", "has_pattern", "dead", "filled")]
-        assert said == [1, 3, 0, 0, 0x8001, 2]
-        assert np.isnan(values(over, "pattern")).all() and np.isnan(values(over, "deviation")).all()
-        assert (fields(zeroing)["state"], fields(zeroing)["contact"]) == (1, -1)
-        assert np.isnan(values(zeroing, "zeroed")).all() and values(zeroing, "counts")[:, 0, 3].tolist() == [-1] * 3
+    def test_each_kind_of_result_hides_the_one_before(self, sink, name):
+        """A later result of a sensor, without a pattern, hides the earlier one."""
+        for result in every_kind():
+            sink.write(result, {})
+            half = shm_read.newest(attach(name))[result.scan.sensor]
+            said = fields(half)
+            source, state = said["source"] - 1, said["state"] - 1
+            assert (CHOICES["source"][source], CHOICES["state"][state]) == (result.source, result.state)
+            unknown = {None: -1, False: 0, True: 1}
+            assert (said["trusted"], said["contact"]) == (unknown[result.trusted], unknown[result.contact])
+            assert (said["dead"], said["filled"]) == ((8, 2) if result.dead else (0, 0))
+            assert said["scan"] == result.scan.number and bool(said["has_pattern"]) == (result.pattern is not None)
+            assert said["force_counts"] == result.force_counts or np.isnan(said["force_counts"])
+            for map_name in ("pattern", "deviation", "zeroed"):
+                shown, made = values(half, map_name), getattr(result, map_name)
+                assert np.isnan(shown).all() if made is None else np.array_equal(shown, made)
+            assert ((values(half, "counts") == -1).all(axis=0) == ~result.scan.fresh).all()
 
-    def test_each_sensor_has_its_own_and_names_of_any_script_fit(self, sink, name):
-        names = ["left/4", "右" * 64, "x" * 64]
+    def test_each_sensor_has_its_own_and_one_too_many_is_refused(self, sink, name):
+        names = ["left/4", "右" * 64, "x" * 64, *map(str, range(SLOTS - 3))]
         assert latest(attach(name), "") is None and latest(attach(name), "left/4") is None, "nobody wrote it"
         for number, sensor in enumerate(names):
             sink.write(make_result(number, sensor=sensor), {})
         memory = attach(name)
-        assert [unpack_from("<q", latest(memory, sensor) or b"", 24)[0] for sensor in names] == [0, 1, 2]
+        assert [fields(latest(memory, sensor) or b"")["scan"] for sensor in names] == [*range(SLOTS)]
         assert latest(memory, "right/4") is None
-
-    def test_a_sensor_too_many_is_refused(self, sink):
-        for number in range(SLOTS):
-            sink.write(make_result(sensor=str(number)), {})
         with pytest.raises(SinkError, match=rf"room for {SLOTS} sensors, and one-more is one more"):
             sink.write(make_result(sensor="one-more"), {})
-
-
-REASONS = ("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline")
 
 
 class TestLayout:
@@ -97,14 +103,7 @@ class TestLayout:
         offsets, known = offsets_of(MEMBERS), [tuple(one.split(":")) for one in VERSION_1.split()]
         assert list(MEMBERS)[: len(known)] == known and offsets[known[-1][0]] == 568
         assert [field.byte for field in IN_MEMORY] == [offsets[field.names[0]] for field in IN_MEMORY], "no gap"
-        choices = {field.name: field.kind.words for field in IN_MEMORY if field.kind.words}
-        assert choices == {
-            "source": ("device", "replay", "emulated"),
-            "state": ("zeroing", "incomplete", "idle", "contact", "dropped", "baseline_in_doubt"),
-            "filled": ("rest", "neighbours"),
-            "wrench_origin": ("nominal", "calibrated"),
-            "untrusted_reason": REASONS,
-        }
+        assert {field.name: field.kind.words for field in IN_MEMORY if field.kind.words} == CHOICES
 
     def test_the_header_tells_where_maps_lie(self, sink, name):
         memory = attach(name)
@@ -181,19 +180,14 @@ class TestReading:
         """Reads go on beyond their number until the writer wrote much, however little processor time it gets."""
         start_writer()
         memory, newest, torn, backwards = attach(name), {"left/4": -1, "right/4": -1}, 0, 0
-        kinds = [(kind, shape, at) for kind, shape, at in Layout(4, 4, 40, 40).maps.values()][1:]
         reads, end_s = count(), time.monotonic() + PATIENCE_S
         while (read := next(reads)) < READS or min(newest.values()) <= 1000:
             assert time.monotonic() < end_s, f"the writer wrote {newest} meanwhile"
             sensor = ("left/4", "right/4")[read % 2]
             half = latest(memory, sensor)
             (number,) = unpack_from("<q", half, 24)
-            wanted = [np.array(number % 60_000, kind).tobytes() for kind, _, _ in kinds]
-            if any(
-                half[at : at + 4 * int(np.prod(shape))] != want * int(np.prod(shape))
-                for want, (_, shape, at) in zip(wanted, kinds, strict=True)
-            ):
-                torn += 1
+            maps = [values(half, map_name) for map_name in ("counts", "pattern", "deviation")]
+            torn += not all((shown == number % 60_000).all() for shown in maps)
             backwards += number < newest[sensor]
             newest[sensor] = number
         assert (torn, backwards) == (0, 0)
@@ -231,24 +225,23 @@ class TestReading:
     def test_only_what_is_young_and_of_a_device_is_acted_on(self, sink, name):
         memory, now_ns = attach(name), time.monotonic_ns()
         result = replace(make_result(7, press_counts=3000, time_ns=now_ns), source="device")
-        young = {"oldest_s": 60.0}
+        old, early = (replace(result.scan, time_ns=now_ns + 60_000_000_000 * sign) for sign in (-1, 1))
+        for changes, why in (
+            ({}, None),
+            ({"scan": old}, r"the newest reading is (60|59)\.\d\d s old, expected under 60"),
+            ({"scan": early}, r"the newest reading is -(60|59)\.\d\d s old, expected under 60"),  # of another machine
+            ({"source": "emulated"}, "its source is emulated, not a device: --pretend"),
+            ({"source": "replay"}, "its source is replay, not a device: --pretend"),
+            ({"state": "baseline_in_doubt", "trusted": False}, ".*baseline is in doubt"),
+        ):
+            sink.write(replace(result, **changes), {})
+            refused = shm_read.refusal(shm_read.newest(memory)["4"], oldest_s=60.0)
+            assert refused is None if why is None else re.match(why, refused)
+            taken = shm_read.latest(memory, "4", oldest_s=60.0)
+            assert (taken is None) == (why is not None)
+            assert "source" not in changes or shm_read.latest(memory, "4", oldest_s=60.0, pretend=True) is not None
         sink.write(result, {})
-        half = shm_read.latest(memory, "4", **young)
-        assert half is not None and fields(half)["scan"] == 7
         assert shm_read.latest(memory, "4", oldest_s=0.0) is None
-        for time_ns in (now_ns - 60_000_000_000, now_ns + 60_000_000_000):  # the latter is of another machine
-            sink.write(replace(result, scan=replace(result.scan, time_ns=time_ns)), {})
-            assert shm_read.latest(memory, "4", **young) is None
-            refused = shm_read.refusal(shm_read.newest(memory)["4"], **young)
-            assert re.fullmatch(r"the newest reading is -?(60|59)\.\d\d s old, expected under 60", refused)
-        for source in ("emulated", "replay"):
-            sink.write(replace(result, source=source), {})
-            assert shm_read.latest(memory, "4", **young) is None
-            refused = shm_read.refusal(shm_read.newest(memory)["4"], **young)
-            assert refused.startswith(f"its source is {source}, not a device: --pretend")
-            assert shm_read.latest(memory, "4", **young, pretend=True) is not None
-        sink.write(replace(result, state="baseline_in_doubt", trusted=False), {})
-        assert "baseline is in doubt" in str(shm_read.refusal(shm_read.newest(memory)["4"], **young))
 
     def test_the_example_prints_what_it_acts_on_until_memory_is_gone(self, name, start_writer):
         start_writer()
@@ -274,7 +267,7 @@ class TestWriters:
             attach(name)
         sink.close()
 
-    def test_a_name_that_another_took_meanwhile_stays(self, name):
+        # A name that another took meanwhile stays.
         sink = SharedMemorySink(name, CONTRACT)
         Path("/dev/shm", name).unlink()
         other = SharedMemorySink(name, CONTRACT)
@@ -323,8 +316,3 @@ class TestWriters:
         with pytest.raises(SinkError, match=r"another program's shared memory"):
             SharedMemorySink(name, CONTRACT)
         assert path.read_bytes() == b"mine" * 100
-
-    def test_without_shared_memory_it_says_so(self, tmp_path, limits):
-        limits(shm, FOLDER=tmp_path / "none")
-        with pytest.raises(SinkError, match=r"needs Linux"):
-            SharedMemorySink("x", CONTRACT)

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import os
 from dataclasses import replace
 
@@ -63,10 +64,6 @@ def test_a_pattern_not_to_be_believed_is_reported_once_a_contact():
 
 
 class TestStatus:
-    @pytest.fixture(autouse=True)
-    def wide(self, monkeypatch):
-        monkeypatch.setenv("COLUMNS", "200")
-
     def make(self):
         self.now_s = 0.0
         self.stream = Terminal()
@@ -78,10 +75,7 @@ class TestStatus:
     @pytest.mark.parametrize(
         ("columns", "line"),
         [
-            (
-                160,
-                "EMULATED | 4 contact not checked 3007 counts 22 mm2 | 6 no stored baseline for sensor 6",
-            ),
+            (160, "EMULATED | 4 contact not checked 3007 counts 22 mm2 | 6 no stored baseline for sensor 6"),
             (53, "EMULATED | 4 contact not checked 3007 counts 22 ..."),
             (3, "..."),
         ],
@@ -114,39 +108,26 @@ class TestStatus:
         sink.write(replace(runtime.push(make_scan(0, press_counts=3000)), **changes), {})
         assert (sink.line() + " ").startswith(line) and sink.line().isascii()
 
-    def test_it_is_rewritten_at_most_ten_times_a_second(self):
-        sink = self.make()
-        result = make_results(1)[0]
+    def test_the_line_shows_silence_at_most_ten_times_a_second(self, monkeypatch):
+        monkeypatch.setenv("COLUMNS", "200")
+        sink, (first, other) = self.make(), make_results(1)
         for _ in range(101):
-            sink.write(result, {})
+            sink.write(first, {})
             self.now_s += 1 / 64
-        assert len(self.shown()) == 1 + 100 // 7  # every 7/64 s
-
-    def test_silence_is_shown(self):
-        sink = self.make()
-        sink.wait()
-        assert self.shown()[-1] == "no scan for 0 s"
-        sink.write(make_results(1)[0], {})
-        self.now_s = 0.99
-        sink.wait()
-        assert "no scan" not in self.shown()[-1]
-        self.now_s = 3.2
+        assert len(self.shown()) == 1 + 100 // 7 and "no scan" not in self.shown()[-1]  # every 7/64 s
+        self.now_s += 3.2
         sink.wait()
         assert self.shown()[-1].startswith("EMULATED | no scan for 3 s | 4 idle")
-        sink.write(
-            make_results(1)[1], {}
-        )  # of another finger, beside which the first must not stand as if it were there
+        sink.write(other, {})  # of another finger, beside which the first must not stand as if it were there
         assert "4 no scan for 3 s" in sink.line() and "6 no scan" not in sink.line()
 
     def test_a_window_that_was_closed_ends_nothing(self):
-        self.now_s = 0.0
         leader, follower = os.openpty()
-        stream = os.fdopen(follower, "w")
-        sink = StatusSink(stream, clock_s=lambda: self.now_s)
-        sink.write(make_results(1)[0], {})
+        stream, result = os.fdopen(follower, "w"), make_results(1)[0]
+        sink = StatusSink(stream, clock_s=itertools.count(step=0.2).__next__)
+        sink.write(result, {})
         os.close(leader)
-        self.now_s = 1.0
-        sink.write(make_results(1)[0], {})
+        sink.write(result, {})
         sink.close()
         with contextlib.suppress(OSError):  # it still has what nobody took
             stream.close()

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import write_npz
-from edge_samples import ROOT, unpack, wait_for
+from edge_samples import PERIOD_NS, ROOT, wait_for
 from matplotlib import colormaps
 
 from edge.api import load_model
@@ -35,7 +35,6 @@ playwright = import_module("playwright.sync_api")
 expect = playwright.expect
 
 TIMEOUT_MS = 60_000
-PERIOD_NS = 10_000_000
 TOKEN = "of-twelve-letters"
 PHONE = (390, 844)
 SIZES = [(844, 390), (1024, 600), (1280, 800), (2560, 1300)]
@@ -48,7 +47,7 @@ NOISE_COUNTS = 3
 def browser():
     playwright.expect.set_options(timeout=TIMEOUT_MS)  # as all that is waited for: the machine may be busy
     with playwright.sync_playwright() as engine:
-        chromium = engine.chromium.launch(executable_path=CHROMIUM, args=["--js-flags=--expose-gc"])
+        chromium = engine.chromium.launch(executable_path=CHROMIUM)
         yield chromium
         chromium.close()
 
@@ -202,11 +201,6 @@ def number(page, name, sensor="4"):
     return page.locator(f'[data-sensor="{sensor}"] [data-number="{name}"]')
 
 
-def moves(page):
-    before = part(page, "force-now").inner_text()
-    expect(part(page, "force-now")).not_to_have_text(before)
-
-
 def live(page):
     page.wait_for_selector('[data-sensor="4"] [data-part="field"][data-live="yes"]')
 
@@ -217,13 +211,6 @@ def word(page, text, sensor="4"):
 
 def logged(page, text):
     expect(page.locator("#log li").filter(has_text=text).first).to_be_visible()
-
-
-def frames_of(page):
-    """Return a growing list of the headers that the page's next sockets receive."""
-    heard = []
-    page.on("websocket", lambda socket: socket.on("framereceived", lambda data: heard.append(unpack(data)[0])))
-    return heard
 
 
 PAINTED = """canvas => canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height)

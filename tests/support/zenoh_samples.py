@@ -106,8 +106,8 @@ def consume():
         consumer.stop()
 
 
-def make_results(count, **of_the_scans):
+def make_results(count):
     """Return results in contact from the second on; every other of those as the one before it."""
     runtime = Runtime(FakeModel(CONTRACT), source="emulated", baselines={"4": BASELINE})
     presses = [0, *(3000 + 200 * (number // 2) for number in range(count - 1))]
-    return [runtime.push(make_scan(n, press_counts=press, **of_the_scans)) for n, press in enumerate(presses)]
+    return [runtime.push(make_scan(n, press_counts=press)) for n, press in enumerate(presses)]

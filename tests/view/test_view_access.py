@@ -110,12 +110,6 @@ def test_whatever_is_asked_is_answered(path, hosts, origins, message):
     execute(message, Commands())
 
 
-def executed(*messages):
-    asked = Commands()
-    why = [execute(m if isinstance(m, (str, bytes)) else json.dumps(m), asked) for m in messages]
-    return asked, why
-
-
 @pytest.mark.parametrize(
     "message",
     [
@@ -126,12 +120,14 @@ def executed(*messages):
     ],
 )
 def test_what_is_no_command_is_counted_and_told(message):
-    asked, [why] = executed(message)
+    asked = Commands()
+    why = execute(message if isinstance(message, (str, bytes)) else json.dumps(message), asked)
     assert asked.refused == 1 and asked.poll() == []
     assert why is not None and "expected {" in why and len(why) < 400 and "\n" not in why
 
 
 def test_where_nobody_polls_a_few_wait_and_others_are_refused():
-    asked, why = executed(*[{"cmd": "reset"}] * (WAITING + 3))
+    asked = Commands()
+    why = [execute('{"cmd": "reset"}', asked) for _ in range(WAITING + 3)]
     assert why.count(None) == WAITING and asked.refused == 3 and len(asked.poll()) == WAITING
     assert execute('{"cmd": "reset"}', asked) is None

@@ -8,13 +8,13 @@ import time
 import browser_samples as web
 import numpy as np
 from bridge_samples import write_recording
-from browser_samples import browser, demo, folder, open_page
+from browser_samples import browser, demo, open_page
 from edge_samples import wait_for
 from websockets.sync.client import connect
 
 from edge.view.frames import MOST_VIEWERS
 
-__all__ = ["browser", "demo", "folder", "open_page"]
+__all__ = ["browser", "demo", "open_page"]
 
 # The force, and the pattern where it is deep, as they are painted at one time.
 LOOK = f"""() => {{
@@ -124,18 +124,3 @@ def test_a_recording_begins_when_its_page_is_opened_and_ends(demo, tmp_path, ope
         assert unseen.wait(60) == 0
     with web.edge_sr("replay", "--example", "--duration-s", "0.5") as unseen:
         assert unseen.wait(60) == 0
-
-
-def test_four_sensors_are_side_by_side_in_their_order(demo, folder, open_page):
-    rest = demo["counts"][:1] + web.noise(200, seed=2)
-    quiet = np.concatenate([rest[:150], np.full_like(rest[:1], -1).repeat(400, axis=0)])
-    with web.emulated(folder, web.then_held(demo, web.pressed(demo)[0]), rest, rest, quiet) as run:
-        page = open_page(run.url)
-        web.live(page)
-        web.expect(web.part(page, "link", "10")).to_have_attribute("data-up", "no")
-        web.expect(web.part(page, "link", "8")).to_have_attribute("data-up", "yes")
-        shown = page.eval_on_selector_all(".sensor", "all => all.map(one => one.dataset.sensor)")
-        assert shown == ["4", "6", "8", "10"]
-        run.emulator.hang_up()
-        for sensor in shown:
-            web.expect(web.part(page, "link", sensor)).to_have_attribute("data-up", "no")

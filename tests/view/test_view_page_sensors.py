@@ -1,7 +1,6 @@
 """The live page as a person sees it: headless Chromium, and a real `edge-sr` that reads emulated sensors."""
 
 import json
-import os
 import re
 
 import browser_samples as web
@@ -12,27 +11,13 @@ from edge_samples import wait_for
 
 __all__ = ["browser", "demo", "folder", "open_page"]
 
-RECONNECTS, FIRST_RECONNECTS = 30, 10  # after the first, all that is made once exists
-
-# Unknown to the page's own program, its sockets are counted but not kept, and its waits are shortened.
+# Unknown to the page's own program, its newest socket is kept.
 WATCH_SOCKETS = """
   const Socket = window.WebSocket;
-  window.sockets = [];
-  window.newest = () => window.sockets.at(-1).deref();
   window.WebSocket = class extends Socket {
-    constructor(...given) { super(...given); window.sockets.push(new WeakRef(this)); }
+    constructor(...given) { super(...given); window.newest = this; }
   };
-  const wait = window.setTimeout;
-  window.setTimeout = (act, ms, ...given) => wait(act, ms / 50, ...given);
 """
-RECONNECT = """async (times) => {
-  for (let time = 0; time < times; time++) {
-    const before = window.sockets.length;
-    window.newest().close();
-    while (window.sockets.length === before) await new Promise((go_on) => setTimeout(go_on, 50));
-    await new Promise((go_on) => window.newest().addEventListener("message", go_on, { once: true }));
-  }
-}"""
 TOLD = """text => [...document.querySelectorAll("#log li")]
   .filter((line) => line.textContent.includes(text))
   .reduce((sum, line) => sum + Number(line.dataset.times), 0)"""
@@ -42,14 +27,6 @@ WATCH_REFUSAL = """() => {
   new MutationObserver(() => window.refusals++).observe(document.querySelector("#refusal"), watch);
 }"""
 AS_SHOWN = "canvas => Math.abs(canvas.width - canvas.clientWidth * devicePixelRatio) < 2"
-INKED = """canvas => {
-  const { data, width, height } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
-  const ink = getComputedStyle(document.documentElement).getPropertyValue("--force").trim();
-  const want = [1, 3, 5].map((at) => parseInt(ink.slice(at, at + 2), 16));
-  const near = (at) => data[at + 3] > 100 && want.every((value, channel) => Math.abs(data[at + channel] - value) < 12);
-  return Array.from({ length: width }, (_, x) =>
-    Array.from({ length: height }, (_, y) => 4 * (y * width + x)).some(near));
-}"""
 SIDES = """all => all.map(one => one.getBoundingClientRect())
   .map(({left, top, right, bottom}) => [left, top, right, bottom])"""
 
@@ -75,12 +52,10 @@ def test_a_held_pad_is_shown_and_measured(held, open_page):
     assert shown.shape == (40, 40) and shown.max() > 0.9 and web.likeness(shown, held.pattern) > 0.99
     high_mm = float(web.part(page, "pattern-high").inner_text().partition("\u202f")[0])
     assert np.sqrt(np.mean((high_mm * shown - held.pattern) ** 2)) < 0.01  # [mm]
-    heard = web.frames_of(page)
-    page.reload()
-    web.live(page)
 
     # Maps, traces and numbers are there, and move.
-    web.moves(page)
+    force = web.part(page, "force-now")
+    web.expect(force).not_to_have_text(force.inner_text())
     for name in ("interval_mm", "run_time_us", "latency_us", "rate_hz"):
         web.expect(web.number(page, name)).to_contain_text(re.compile(r"[1-9]"))
     web.expect(page.locator("#about")).to_contain_text("stsr-int8")
@@ -92,7 +67,6 @@ def test_a_held_pad_is_shown_and_measured(held, open_page):
         assert rgba.shape[:2] == shape and len(np.unique(rgba.reshape(-1, 4), axis=0)) > 5
 
     # Shear is drawn in place of the area.
-    wait_for(lambda: any(point[4] is not None for header in heard for point in header.get("trace", [])))
     toggle = web.part(page, "shear_toggle")
     for state in ("true", "false"):
         toggle.click()
@@ -117,13 +91,8 @@ def test_a_held_pad_is_shown_and_measured(held, open_page):
     page.keyboard.press("Escape")
     web.expect(page.locator("#manual")).to_be_hidden()
     page.locator("#zero").focus()
-    reached = ["zero"]
-    for _ in range(8):
-        page.keyboard.press("Tab")
-        reached.append(page.evaluate("document.activeElement.id || document.activeElement.dataset.part"))
-    want = ["zero", "reset", "help", "span", "log"]
-    assert [name for name in reached if name in want][: len(want)] == want
-    page.locator("#reset").focus()
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.id") == "reset"
     assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
 
     # Nothing runs over on any screen, and a phone reads by touch.
@@ -144,13 +113,8 @@ def test_a_held_pad_is_shown_and_measured(held, open_page):
     assert other.evaluate(web.RUNS_OVER) == 0
 
 
-NODES_SHOWN = "let all = document.createNodeIterator(document), count = 0; while (all.nextNode()) count += 1; count"
-
-
-def test_reconnects_lose_and_repeat_nothing(held, open_page):
+def test_a_reconnect_repeats_nothing(held, open_page):
     page, other = open_page(held.url, script=WATCH_SOCKETS), open_page(held.url)
-
-    # After a reconnect nothing is told twice.
     web.live(page)
     web.live(other)
     for times in (1, 2):
@@ -158,44 +122,12 @@ def test_reconnects_lose_and_repeat_nothing(held, open_page):
         wait_for(lambda times=times: page.evaluate(TOLD, "zeroing refused") == times)
     web.expect(page.locator("#refusal")).to_be_hidden()
     page.evaluate(WATCH_REFUSAL)
-    page.evaluate(RECONNECT, 1)
+    page.evaluate("newest.close()")
+    web.logged(page, "connected again")
     other.keyboard.press("r")
     web.logged(page, "earlier taps forgotten")  # after all that a newcomer is sent
     assert page.evaluate(TOLD, "zeroing refused") == 2 and page.evaluate("refusals") == 0
-
-    # A held pad draws a line: what was missed meanwhile leaves no hole of 0.7 s in it, nor in the other page's.
     web.live(page)
-    here, there = (max(np.diff(np.flatnonzero(web.part(one, "force-plot").evaluate(INKED)))) for one in (page, other))
-    assert here < there + 0.07 * web.part(page, "force-plot").evaluate("canvas => canvas.width")
-
-    # Many reconnects leave nothing.
-    devtools = page.context.new_cdp_session(page)
-    devtools.send("Performance.enable")
-
-    def kept():
-        """Return Chromium's counts after garbage collection, the least of a few; nodes are those not in the page."""
-        counted = []
-        for _ in range(4):
-            devtools.send("HeapProfiler.collectGarbage")
-            metrics = {one["name"]: one["value"] for one in devtools.send("Performance.getMetrics")["metrics"]}
-            counted.append(metrics | {"Nodes": metrics["Nodes"] - page.evaluate(NODES_SHOWN)})
-        return {name: min(once[name] for once in counted) for name in counted[0]}
-
-    def open_files():
-        return len(os.listdir(f"/proc/{held.pid}/fd"))  # noqa: PTH208
-
-    web.resize(page, 390, 300)
-    page.evaluate(RECONNECT, FIRST_RECONNECTS)
-    before, files = kept(), open_files()
-    page.evaluate(RECONNECT, RECONNECTS)
-    web.live(page)
-    after = kept()
-    page.wait_for_function("gc(), sockets.filter((one) => one.deref() !== undefined).length <= 2")
-    assert after["JSEventListeners"] <= before["JSEventListeners"] + 5
-    assert after["Nodes"] <= before["Nodes"] + RECONNECTS / 2
-    assert after["JSHeapUsedSize"] < before["JSHeapUsedSize"] + 500_000
-    wait_for(lambda: open_files() <= files + 2)
-    web.logged(page, "connected again")
 
 
 def zero(page, sensor, ask):

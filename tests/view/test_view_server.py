@@ -19,7 +19,6 @@ from websockets.exceptions import ConnectionClosed
 from edge.cli.main import main
 from edge.pipeline.result_stream import uncollected
 from edge.view import frames, server
-from edge.view.frames import MOST_VIEWERS
 from edge.view.server import SCRIPTS, TIDY_CONNECTIONS, Connection, load_page
 
 __all__ = ["page"]
@@ -85,27 +84,21 @@ class TestFrames:
         assert threading.active_count() <= threads
 
 
-class TestAsked:
-    def test_a_message_that_is_too_long_ends_its_connection_alone(self, page):
-        with page.viewer() as viewer, page.viewer() as other:
-            viewer.send("x" * 5000)
+def test_who_asks_too_much_or_too_long_harms_nobody():
+    with ExitStack() as run:
+        page = run.enter_context(live_page())
+        with page.viewer() as long, page.viewer() as viewer, page.viewer() as other:
+            long.send("x" * 5000)
             with pytest.raises(ConnectionClosed) as caught:
                 while True:
-                    viewer.recv(TIMEOUT_S)
+                    long.recv(TIMEOUT_S)
             assert caught.value.rcvd is not None and caught.value.rcvd.code == 1009
+            for _ in range(500):
+                viewer.send(json.dumps({}))
             page.play()
             assert frame(other, "result")
-
-    def test_who_never_stops_asking_is_heard_at_a_persons_pace(self):
-        with ExitStack() as run:
-            page = run.enter_context(live_page())
-            with page.viewer() as viewer, page.viewer() as other:
-                for _ in range(500):
-                    viewer.send(json.dumps({}))
-                page.play()
-                assert frame(other, "result")
-                run.close()
-            assert page.asked.refused < 250  # what waits is not read to its end, either
+            run.close()
+        assert page.asked.refused < 250  # heard at a person's pace, and what waits is not read to its end
 
 
 def test_a_port_in_use_is_one_line_and_5(capsys):
@@ -113,8 +106,8 @@ def test_a_port_in_use_is_one_line_and_5(capsys):
         port = taken.getsockname()[1]
         assert main(["--source", "slcan:/dev/no-such-port", "--view", str(port)]) == 5
     assert capsys.readouterr().err == (
-        f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: address in use; "
-        "name another port with --view, or 0 for any free one\n"
+        f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: Address already in use; "
+        "name another port with --view, 0 for any free one, or an address of this machine with --view-host\n"
     )
 
 
@@ -139,39 +132,12 @@ def seen_by(viewer):
     return frame(viewer, "state")[0]["viewers"]
 
 
-def test_who_never_reads_costs_little_and_harms_nobody(page, limits):
-    limits(frames, LATE_S=0.1)
-    with page.viewer() as other, page.stranger(HANDSHAKE) as blocked:
-        with page.playing():
-            shown = [frame(other, "result") for _ in range(30)]
-        sent = b""
-        blocked.settimeout(0.5)
-        with suppress(TimeoutError):
-            while data := blocked.recv(1 << 16):
-                sent += data
-    assert b'"hello"' in sent and len(sent) < 15 * sum(one.nbytes for one in shown[0][1].values())
-
-
 def test_the_place_of_who_takes_nothing_is_free_again(page, limits):
     """As of who never reads, and of whose network vanished: both look alike from here."""
     limits(server, GONE_S=1.5)
     with page.viewer() as other, page.playing(), page.stranger(HANDSHAKE):
         wait_for(lambda: seen_by(other) == 2)
         wait_for(lambda: seen_by(other) == 1)
-
-
-def test_as_many_are_admitted_as_there_is_room_for(page):
-    with ExitStack() as viewers:
-        many = [viewers.enter_context(page.viewer()) for _ in range(2 * MOST_VIEWERS)]
-        refused = 0
-        for viewer in many:
-            try:
-                assert frame(viewer)[0]["kind"] == "hello"
-            except ConnectionClosed as closed:
-                assert (closed.rcvd.code, closed.rcvd.reason) == (1013, f"too many viewers ({MOST_VIEWERS}): close one")
-                refused += 1
-        assert refused == MOST_VIEWERS
-        wait_for(lambda: seen_by(many[0]) == MOST_VIEWERS)
 
 
 def test_behind_a_pause_in_reading_comes_the_newest(page, limits):

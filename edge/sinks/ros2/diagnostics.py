@@ -9,8 +9,7 @@ from edge.sinks.json_records import record
 from edge.sinks.ros2.messages import DIAGNOSTIC_ARRAY, header
 from firmware_bridge.schedule import SHOWN_SILENT_S
 
-OK, WARN, ERROR, STALE = range(4)
-"""Levels, numbered as in diagnostic_msgs/DiagnosticStatus."""
+OK, WARN, ERROR, STALE = range(4)  # levels, as in diagnostic_msgs/DiagnosticStatus
 _STATES: Final = {"incomplete": ERROR, "zeroing": WARN, "baseline_in_doubt": ERROR}
 _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")
 OUTAGES: Final = ("lost", "silent")

@@ -43,10 +43,7 @@ def in_si(name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
-    """Return a map (H, W) as an Image of encoding 32FC1, x to the right and y down.
-
-    A map (3, H, W) of vectors becomes one of 3 H rows: x, below it y, below it z.
-    """
+    """Return a map (H, W), or one (3, H, W) of vectors as 3 H rows of x, y and z, as an Image of encoding 32FC1."""
     pixels = np.ascontiguousarray(values.reshape(-1, values.shape[-1]), dtype="<f4")
     height, width = pixels.shape
     return IMAGE.encode(
@@ -85,10 +82,7 @@ def grid(name: str, values: NDArray[np.float32], frame: str, unix_ns: int, geome
 
 
 def recorded_map(data: bytes) -> NDArray[np.float32]:
-    """Return the map (H, W), or (3, H, W) of vectors, in a Grid.
-
-    Raises a CdrError where it is none, a ValueError where it is of other numbers.
-    """
+    """Return the map (H, W), or (3, H, W) of vectors, in a Grid; a CdrError or ValueError where it is none of ours."""
     message = GRID.decode(data)
     count, kinds = len(message["fields"]), {field["type"] for field in message["fields"]}
     if kinds != {_FLOAT32}:
@@ -110,10 +104,9 @@ def taxels(scan: Scan) -> NDArray[np.float32]:
 
 
 def points(result: Result, geometry: SensorGeometry, frame: str, unix_ns: int) -> bytes:
-    """Return a pattern as a cloud of a point per pixel; without a pattern, an empty cloud.
+    """Return a pattern as a cloud of a point per pixel, in [m] and [N]; without a pattern, an empty cloud.
 
-    The fields are float32: x and y on the pad's face and z into it, in [m]; the force on the pixel fx, fy, fz in [N]
-    and the standard deviation sigma of z in [m], NaN where the model gives none.
+    What the model does not give is NaN; docs/ros2.md describes the fields, and those of contacts.
     """
     cloud = np.empty((0, 0, len(_POINT_FIELDS)), dtype="<f4")
     if result.pattern is not None:
@@ -129,11 +122,7 @@ def points(result: Result, geometry: SensorGeometry, frame: str, unix_ns: int) -
 
 
 def contacts(patches: Sequence[Patch], frame: str, unix_ns: int) -> bytes:
-    """Return separate contacts as a cloud of a point each, the strongest first; without one, an empty cloud.
-
-    The fields are float32: the middle x, y on the pad's face in [m], z 0; the force fx, fy, fz in [N], NaN where the
-    model gives none; the normal nx, ny, nz into the pad; area in [m2], length and width in [m], long_axis in [rad].
-    """
+    """Return separate contacts as a cloud of a point each, in [m], [N] and [rad]; without one, an empty cloud."""
     rows = np.array(
         [
             [

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import orjson
 
-from edge.errors import SinkError, UsageError
+from edge.errors import UsageError
 from edge.perception.event import Event, EventKind
 from edge.perception.record_fields import FIELDS, Columns, Out
 from edge.perception.result import Result
@@ -183,9 +183,6 @@ def log_message(event: Event, unix_ns: int) -> bytes:
     )
 
 
-LONGEST_TOPIC: Final = 247  # limit of ROS; DDS takes 255, some of which are for prefixes
-
-
 def base_topic(text: str) -> str:
     """Return a topic as a user writes it without its leading slash, or raise a UsageError."""
     topic = text.removeprefix("/")
@@ -204,16 +201,6 @@ def sensor_path(sensor: str) -> str:
     UTF-8 in hexadecimal digits.
     """
     return "/".join(map(_token, sensor.split("/")))
-
-
-def sensor_topic(base: str, sensor: str, what: str) -> str:
-    """Return the topic of one thing that is published of a sensor; a SinkError where it is too long for ROS."""
-    topic = "/".join((base, sensor_path(sensor), what))
-    if len(topic) >= LONGEST_TOPIC:
-        raise SinkError(
-            f"topic {topic} has {len(topic)} characters, ROS holds {LONGEST_TOPIC - 1}: name sensor {sensor!r} shorter"
-        )
-    return topic
 
 
 def _token(part: str) -> str:

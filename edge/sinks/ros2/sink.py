@@ -22,26 +22,10 @@ from edge.pipeline.commands import Command, Commands, runtime_command
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.sinks.json_records import event_record
+from edge.sinks.ros2 import messages as ros
 from edge.sinks.ros2.dds_domain import join, reader, taken, writer
 from edge.sinks.ros2.diagnostics import OUTAGES, Diagnostics
 from edge.sinks.ros2.map_messages import contacts, image, in_si, points, taxels
-from edge.sinks.ros2.messages import (
-    DIAGNOSTIC_ARRAY,
-    IMAGE,
-    POINT_CLOUD,
-    POINT_STAMPED,
-    STRING,
-    TF_MESSAGE,
-    TYPES,
-    WRENCH_STAMPED,
-    base_topic,
-    frame_of,
-    header,
-    sensor_topic,
-    transforms,
-    wrench,
-    wrench_message,
-)
 from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
 
@@ -83,25 +67,24 @@ class Ros2Sink(Sink):
         *,
         environment: Mapping[str, str] = os.environ,
         clock_ns: Callable[[], int] = time.monotonic_ns,
-        unix_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Join the domain of the environment; `topic` is the first part of all topics but diagnostics and frames.
 
         `clock_ns` is the clock of scans of now; wall time is read once, because the clock may be set during the run.
         """
-        self._base, self._source, self._clock_ns = base_topic(topic), source.kind, clock_ns
+        self._base, self._source, self._clock_ns = ros.base_topic(topic), source.kind, clock_ns
         self._contract = contract
         self._geometry, self._frames = source.sensor_file.geometry, source.sensor_file.frames
         offset_ns = source.unix_offset_ns
         self._of_now = offset_ns is None
-        self.unix_offset_ns = unix_ns() - clock_ns() if offset_ns is None else offset_ns
+        self.unix_offset_ns = time.time_ns() - clock_ns() if offset_ns is None else offset_ns
         self.unwritten = 0
         self._sensors: dict[str, _Sensor] = {}
         self._domain, self._participant = join(environment)
-        self._events = writer(self._participant, f"{self._base}/events", STRING, depth=100)
+        self._events = writer(self._participant, f"{self._base}/events", ros.STRING, depth=100)
         self._diagnosed_ns, self._diagnostics = clock_ns(), Diagnostics(self._base)
-        self._states = writer(self._participant, "diagnostics", DIAGNOSTIC_ARRAY)  # the topic of ROS's own tools
-        self._placed = writer(self._participant, "tf_static", TF_MESSAGE, latched=True) if self._frames else None
+        self._states = writer(self._participant, "diagnostics", ros.DIAGNOSTIC_ARRAY)  # the topic of ROS's own tools
+        self._placed = writer(self._participant, "tf_static", ros.TF_MESSAGE, latched=True) if self._frames else None
         self._asked = None if commands is None else self._subscribed(commands)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
@@ -109,18 +92,18 @@ class Ros2Sink(Sink):
         scan = result.scan
         sensor = self._sensors.get(scan.sensor)
         if sensor is None:
-            sensor = self._sensors[scan.sensor] = _Sensor(frame_of(result), result)
+            sensor = self._sensors[scan.sensor] = _Sensor(ros.frame_of(result), result)
             self._place_pads()
         sensor.last = result
         unix_ns = scan.on_bus_ns + self.unix_offset_ns
-        self._publish_to(sensor, "taxels", IMAGE, lambda: image(taxels(scan), sensor.frame, unix_ns))
+        self._publish_to(sensor, "taxels", ros.IMAGE, lambda: image(taxels(scan), sensor.frame, unix_ns))
         if result.pattern is not None:
             self._show(sensor, result, unix_ns)
         elif result.state != "dropped":  # a newer scan has already published a pattern
             self._clear(sensor, unix_ns, 0.0 if result.contact is False else np.nan)
-        force = wrench(result, self._geometry, unix_ns)
+        force = ros.wrench(result, self._geometry, unix_ns)
         if force is not None:
-            self._publish_to(sensor, "wrench", WRENCH_STAMPED, lambda: force)
+            self._publish_to(sensor, "wrench", ros.WRENCH_STAMPED, lambda: force)
             sensor.forced = result.wrench is not None
         if result.state != "dropped":
             self._publish_numbers(sensor, result, result.state)
@@ -158,7 +141,7 @@ class Ros2Sink(Sink):
         """Return the readers of commands by name; the loop reads them before each scan, for they have no thread."""
         topics = {name: f"{self._base}/{name}" for name in ("zero", "reset")}
         readers = {
-            name: reader(self._participant, topic, STRING, _COMMANDS_KEPT, reliable=True)
+            name: reader(self._participant, topic, ros.STRING, _COMMANDS_KEPT, reliable=True)
             for name, topic in topics.items()
         }
 
@@ -178,7 +161,7 @@ class Ros2Sink(Sink):
         """Publish what `make` returns, if anybody subscribes: that costs far more than to ask."""
         to = sensor.writers.get(what)
         if to is None:
-            topic = sensor_topic(self._base, sensor.last.scan.sensor, what)
+            topic = f"{self._base}/{ros.sensor_path(sensor.last.scan.sensor)}/{what}"
             to = sensor.writers[what] = writer(self._participant, topic, kind)
         if self.is_read(to):
             self.publish(to, make())
@@ -200,15 +183,15 @@ class Ros2Sink(Sink):
         frame = sensor.frame
         for name, values in (("pattern", result.pattern), ("deviation", result.deviation)):
             if values is not None:
-                self._publish_to(sensor, name, IMAGE, partial(image, in_si(name, values), frame, unix_ns))
+                self._publish_to(sensor, name, ros.IMAGE, partial(image, in_si(name, values), frame, unix_ns))
                 sensor.shown[name] = values.shape
         if result.centroid_mm is not None:
             x, y = (place / 1e3 for place in result.centroid_mm)
-            message = {"header": header(frame, unix_ns), "point": {"x": x, "y": y, "z": 0.0}}
-            self._publish_to(sensor, "centroid", POINT_STAMPED, lambda: POINT_STAMPED.encode(message))
-        self._publish_to(sensor, "points", POINT_CLOUD, lambda: points(result, self._geometry, frame, unix_ns))
+            message = {"header": ros.header(frame, unix_ns), "point": {"x": x, "y": y, "z": 0.0}}
+            self._publish_to(sensor, "centroid", ros.POINT_STAMPED, lambda: ros.POINT_STAMPED.encode(message))
+        self._publish_to(sensor, "points", ros.POINT_CLOUD, lambda: points(result, self._geometry, frame, unix_ns))
         find_patches = partial(patches, result, self._contract)  # as long as the pattern takes: only for a subscriber
-        self._publish_to(sensor, "contacts", POINT_CLOUD, lambda: contacts(find_patches(), frame, unix_ns))
+        self._publish_to(sensor, "contacts", ros.POINT_CLOUD, lambda: contacts(find_patches(), frame, unix_ns))
 
     def _clear(self, sensor: _Sensor, unix_ns: int, pattern_value: float) -> None:
         """Publish once, where there were maps, that they no longer hold: zeros, or NaN where nothing is known.
@@ -217,18 +200,18 @@ class Ros2Sink(Sink):
         """
         if sensor.forced and pattern_value == 0:
             zero = (0.0, 0.0, 0.0)
-            none = partial(wrench_message, zero, zero, sensor.frame, unix_ns)
-            self._publish_to(sensor, "wrench", WRENCH_STAMPED, none)
+            none = partial(ros.wrench_message, zero, zero, sensor.frame, unix_ns)
+            self._publish_to(sensor, "wrench", ros.WRENCH_STAMPED, none)
         sensor.forced = False
         if not sensor.shown:
             return
         for name, shape in sensor.shown.items():
             values = np.full(shape, pattern_value if name == "pattern" else np.nan, dtype=np.float32)
-            self._publish_to(sensor, name, IMAGE, partial(image, values, sensor.frame, unix_ns))
+            self._publish_to(sensor, name, ros.IMAGE, partial(image, values, sensor.frame, unix_ns))
         sensor.shown.clear()
         empty = partial(points, replace(sensor.last, pattern=None), self._geometry, sensor.frame, unix_ns)
-        self._publish_to(sensor, "points", POINT_CLOUD, empty)
-        self._publish_to(sensor, "contacts", POINT_CLOUD, partial(contacts, (), sensor.frame, unix_ns))
+        self._publish_to(sensor, "points", ros.POINT_CLOUD, empty)
+        self._publish_to(sensor, "contacts", ros.POINT_CLOUD, partial(contacts, (), sensor.frame, unix_ns))
 
     def _clear_of_all(self, sensor: _Sensor, time_ns: int, why: str) -> None:
         self._clear(sensor, time_ns + self.unix_offset_ns, np.nan)
@@ -242,21 +225,21 @@ class Ros2Sink(Sink):
 
         for name, value_of in NUMBERS.items():
             number = None if result is None else value_of(result)
-            publish(name, TYPES["std_msgs/Float64"], math.nan if number is None else number)
+            publish(name, ros.TYPES["std_msgs/Float64"], math.nan if number is None else number)
         trusted = None if result is None else result.trusted
-        publish("trusted", TYPES["std_msgs/Int8"], -1 if trusted is None else int(trusted))
-        publish("state", STRING, state)
+        publish("trusted", ros.TYPES["std_msgs/Int8"], -1 if trusted is None else int(trusted))
+        publish("state", ros.STRING, state)
 
     def _place_pads(self) -> None:
         """Publish where the pads are that have been seen so far; late subscribers get it as well."""
         places = self._frames
         frames = {sensor.frame: places[name] for name, sensor in self._sensors.items() if name in places}
         if self._placed is not None and frames:
-            self.publish(self._placed, transforms(frames, self._now_ns() + self.unix_offset_ns))
+            self.publish(self._placed, ros.transforms(frames, self._now_ns() + self.unix_offset_ns))
 
     def _tell(self, event: Event, counters: Mapping[str, int]) -> None:
         text = orjson.dumps(event_record(event, counters, self._source)).decode()
-        self.publish(self._events, STRING.encode({"data": text}))
+        self.publish(self._events, ros.STRING.encode({"data": text}))
 
     def _diagnose(self, *, ended: bool = False) -> None:
         self._diagnosed_ns, now_ns = self._clock_ns(), self._now_ns()
@@ -273,7 +256,7 @@ class Ros2Sink(Sink):
 def _command(name: str, message: bytes) -> Command | None:
     """Return the command in a message: an empty text is for all sensors, else it names the sensor to zero."""
     try:
-        sensor = STRING.decode(message)["data"]
+        sensor = ros.STRING.decode(message)["data"]
     except CdrError:
         return None
     return runtime_command({"cmd": name} | ({"sensor": sensor} if sensor else {}))

@@ -33,7 +33,6 @@ function unpack(buffer) {
 
 const SILENT_S = 2.5; // the program sends a frame every second
 const WAITS_S = [0.25, 0.5, 1, 2, 4];
-const VERSION = 1;
 
 class Link {
   constructor({ onFrame, onChange }) {

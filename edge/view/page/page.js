@@ -44,27 +44,18 @@ const page = {
 
 function announce(text) { say(byId("live"), text); }
 
-/** Add a line; one of the same key as the line before, or `again` as any line, is counted instead, since only its numbers may differ. */
-function log(what, { key = what, bad = false, ageS = 0, again = false } = {}) {
+/** Add a line, in place of one of the same key, which is counted: only its numbers may differ. */
+function log(what, { key = what, bad = false, ageS = 0 } = {}) {
   const list = byId("log");
   const clock = new Date(Date.now() - 1000 * ageS).toLocaleTimeString();
   list.querySelector(".none")?.remove();
-  const first = again ? [...list.children].find((line) => line.dataset.key === key) : list.firstElementChild;
-  if (first?.dataset.key === key) {
-    list.prepend(first);
-    first.dataset.times = String(Number(first.dataset.times) + 1);
-    [clock, what, `${first.dataset.times} times`].forEach((text, place) => { first.children[place].textContent = text; });
-    return;
-  }
+  const before = [...list.children].find((line) => line.dataset.key === key);
+  before?.remove();
   const line = document.createElement("li");
-  line.dataset.key = key;
-  line.dataset.times = "1";
-  const time = line.appendChild(document.createElement("time"));
-  time.textContent = clock;
-  const words = line.appendChild(document.createElement("span"));
-  words.textContent = what;
-  words.classList.toggle("bad", bad);
-  line.append(document.createElement("span"));
+  const times = 1 + Number(before?.dataset.times ?? 0);
+  Object.assign(line.dataset, { key, times });
+  for (const [tag, text] of [["time", clock], ["span", what], ["span", times > 1 ? `${times} times` : ""]]) line.appendChild(document.createElement(tag)).textContent = text;
+  line.querySelector("span").classList.toggle("bad", bad);
   list.prepend(line);
   while (list.children.length > 100) list.lastChild.remove();
   if (bad) announce(what);
@@ -127,7 +118,6 @@ function titleText(source) {
 
 const frameHandlers = {
   hello(header) {
-    if (header.version !== VERSION) log(`this page is of another version (${VERSION}) than edge-sr (${header.version}): load it again`, { bad: true });
     if (page.hello !== null && page.hello.run !== header.run) forgetRun();
     page.hello = header;
     document.documentElement.style.setProperty("--pad", `${header.cols} / ${header.rows}`);

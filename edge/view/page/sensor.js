@@ -82,7 +82,7 @@ class Sensor {
     const shown = note_kinds.filter((kind) => kind !== "rest_level" && kind !== "baseline_in_doubt");
     const kinds = shown.length === 0 ? "" : JSON.stringify([shown, dead]);
     if (kinds !== "" && kinds !== this.noteKinds && !(first && this.result.state === "zeroing")) {
-      log(`sensor ${this.name}: ${note}`, { key: `${this.name} ${kinds}`, again: true });
+      log(`sensor ${this.name}: ${note}`, { key: `${this.name} ${kinds}` });
     }
     this.noteKinds = kinds;
   }
