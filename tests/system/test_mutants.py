@@ -1,4 +1,4 @@
-"""The mutator of the mutation survey."""
+"""The mutation survey, of one mutant."""
 
 import subprocess
 import sys
