@@ -9,13 +9,13 @@ from typing import Any, Final
 import numpy as np
 from chaos_wire import FaultyBus, Sent
 from numpy.typing import NDArray
+from program_cost import REST_COUNTS, away_from_press
 
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 RATE_HZ: Final = 100.0
 TELLING: Final = 70
 """Steps of x, and of y: a reading tells its cycle modulo TELLING**2, 49 s."""
-REST_COUNTS: Final = (16_000, 16_400, 38_600)
 PRESS_COUNTS: Final = 3000
 STALE_CYCLES: Final = 10
 HELD_CYCLES: Final = 15
@@ -27,41 +27,25 @@ _RECEIVED: Final = re.compile(r"^received: (.*)$", re.MULTILINE)
 
 def telling(number: int, *, touched: bool) -> NDArray[np.int64]:
     """Return scans (TELLING**2, 16, 3) of a sensor whose x and y tell cycle, taxel and sensor."""
-    cycles = np.arange(TELLING**2)
+    cycles = np.arange(TELLING**2)[:, None]
     taxels = np.arange(16)
-    shift = cycles[:, None] + 7 * taxels + 16 * number
-    counts = np.empty((len(cycles), 16, 3), dtype=np.int64)
-    counts[..., 0] = REST_COUNTS[0] + shift % TELLING - TELLING // 2
-    counts[..., 1] = REST_COUNTS[1] + shift // TELLING % TELLING - TELLING // 2
-    turn = 2 * np.pi * cycles[:, None] / 100
-    away = (taxels // 4 - 1.5 - np.sin(turn)) ** 2 + (taxels % 4 - 1.5 - np.cos(turn)) ** 2
-    pressed = (cycles % 500 >= 250)[:, None] & touched
-    counts[..., 2] = REST_COUNTS[2] + 37 * taxels + np.where(pressed, np.rint(PRESS_COUNTS * np.exp(-away / 2)), 0)
-    return counts
+    shift = cycles + 7 * taxels + 16 * number
+    pressed = np.rint(PRESS_COUNTS * np.exp(-away_from_press(cycles) / 2)) * (touched & (cycles % 500 >= 250))
+    told = (shift % TELLING - TELLING // 2, shift // TELLING % TELLING - TELLING // 2, pressed)
+    return REST_COUNTS + np.stack(told, axis=-1).astype(np.int64)
 
 
 class Judge:
-    """Judge of records, in their order.
-
-    Attributes:
-        broken: promises that were not kept, in plain words.
-        records: number of records of scans, by sensor.
-        events: number of events, by kind.
-        patterns, whole, missing: number of patterns, of whole scans, and of taxels that records say are missing.
-        counters: the last that a record had, with what the summary at the end has.
-        latencies_us: of the patterns since they were last taken.
-        back_ns: times at which the adapter of each bus, by its prefix, could be used again, in [ns].
-        back_s: longest time from an adapter that can be used again to a record of what came after, in [s].
-    """
+    """Judge of records, in their order."""
 
     def __init__(self) -> None:
-        self.broken: list[str] = []
-        self.records, self.events = Counter[str](), Counter[str]()
-        self.patterns = self.whole = self.missing = 0
-        self.counters: dict[str, int] = {}
-        self.latencies_us: list[float] = []
+        self.broken: list[str] = []  # promises that were not kept, in plain words
+        self.records, self.events = Counter[str](), Counter[str]()  # by sensor, by kind
+        self.patterns = self.whole = self.missing = 0  # patterns, whole scans, taxels that records say are missing
+        self.counters: dict[str, int] = {}  # the last that a record had, with what the summary at the end has
+        self.latencies_us: list[float] = []  # of the patterns since they were last taken
+        # Times in [ns] at which the adapter of each bus, by its prefix, could be used again, and was not yet.
         self.back_ns: dict[str, list[int]] = {}
-        self.back_s = 0.0
         self._sent: dict[tuple[str, int], dict[tuple[int, int], tuple[int, int, int]]] = {}
         self._shown: dict[tuple[str, int], tuple[int, int]] = {}
         self._numbers: dict[str, int] = {}
@@ -94,7 +78,9 @@ class Judge:
             elif cycle <= self._shown.get((sensor, taxel), (-1, 0))[0]:
                 self.broken.append(f"{name}: taxel {taxel} has cycle {cycle} a second time")
             cycles[taxel] = self._shown[sensor, taxel] = (cycle, at_ns)
-        self._go_on(record, max(at_ns for _, at_ns in cycles.values()) if cycles else 0)
+        back_ns = self.back_ns.get("".join(sensor.rpartition("/")[:2]), [])
+        while back_ns and back_ns[0] < max((at_ns for _, at_ns in cycles.values()), default=0):
+            back_ns.pop(0)
         if len(cycles) == 16:
             self.whole += 1
             if record["device_time_ns"] is not None and len({cycle for cycle, _ in cycles.values()}) > 1:
@@ -114,12 +100,6 @@ class Judge:
             self._shown = {key: shown for key, shown in self._shown.items() if key[0] != sensor}
             if self._left_out > self.counters["unwritten"] + self.counters["overruns"]:
                 self.broken.append(f"{name}: {gap} scans before it left no trace in the counters")
-
-    def _go_on(self, record: dict[str, Any], newest_ns: int) -> None:
-        """Measure how long an adapter waited that could be used again."""
-        back_ns = self.back_ns.get("".join(record["sensor"].rpartition("/")[:2]), [])
-        while back_ns and back_ns[0] < newest_ns:
-            self.back_s = max(self.back_s, (record["time_ns"] - back_ns.pop(0)) / 1e9)
 
     def _pattern(self, record: dict[str, Any], cycles: dict[int, tuple[int, int]]) -> Iterator[str]:
         """Yield what is wrong with a pattern."""

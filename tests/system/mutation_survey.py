@@ -278,14 +278,14 @@ def page(names: Sequence[str], scores: Sequence[Score], seed: int) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", choices=[*SUBJECTS, []], metavar="MODULE", help=", ".join(SUBJECTS))
     parser.add_argument("--mutants", type=int, default=60, help="the most of each module (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="by which they are drawn (default: %(default)s)")
     parser.add_argument("--out", type=Path, help="report (default: on stdout)")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     os.chdir(ROOT)
     names, scores, text = options.names or [*SUBJECTS], list[Score](), ""
     for name in names:
