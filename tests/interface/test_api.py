@@ -100,6 +100,13 @@ def stream(source, model=None, **settings):
         (lambda source: Stream(source, None), "runtime is None, expected what open_runtime returned"),
         (lambda _: Stream(None, None), "source is None, expected an open one"),
         (lambda _: api.Commands().put("zero"), r'command is \'zero\', expected a Command, such as Command\("zero"\)'),
+        *(
+            (
+                lambda _, wrong=wrong: api.Command(*wrong),
+                r"^Command\(name=.*, expected 'reset' or 'zero', a sensor's name",
+            )
+            for wrong in (("Reset",), ("zero", 4), ("zero", "4", 1), ("zero", ""))
+        ),
         (lambda _: api.Commands().poses.put(PadPose(0, 0)), "pose is PadPose.*, expected a TimedPose"),
         (lambda source: open_runtime(FakeModel(), source).pose((1, 2, 3), 0), r"pose is \(1, 2, 3\), expected a PadP"),
         (lambda _: api.ObjectMap(centre_mm=(NAN, 0)), r"centre of a map is \(nan, 0\), expected two finite numbers"),

@@ -11,6 +11,7 @@ import sys
 import termios
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,12 +35,6 @@ def taken(commands, count):
     got = []
     wait_for(lambda: got.extend(commands.poll()) or len(got) + commands.refused >= count)
     return got
-
-
-def polled_stdin():
-    commands = Commands()
-    with read_stdin(commands):
-        return commands.poll()
 
 
 @pytest.fixture
@@ -103,41 +98,38 @@ def test_poses_and_commands_part_and_bad_lines_stop_nothing(pipe):
 
 def test_a_terminal_and_a_missing_stdin_are_left_alone(stdin):
     leader, follower = os.openpty()
+    os.write(leader, b'{"cmd": "reset"}\n')
     with os.fdopen(follower) as terminal:
-        stdin(terminal)
-        os.write(leader, b'{"cmd": "reset"}\n')
-        assert polled_stdin() == []
-    assert polled_stdin() == []  # closed
-    stdin(None)
-    assert polled_stdin() == []
+        for given in (terminal, None):
+            stdin(given)
+            commands = Commands()
+            with read_stdin(commands):
+                assert commands.poll() == []
+    stdin(terminal)  # closed
+    with read_stdin(commands):
+        assert commands.poll() == []
     os.close(leader)
-
-
-class Told:
-    def __init__(self):
-        self.done = []
-
-    def reset(self):
-        self.done.append("reset")
-
-    def zero(self, name=None, *, force=False):
-        self.done.append((name, force))
 
 
 def test_all_places_are_asked_and_obeyed_in_their_order(stdin, pipe):
     with os.fdopen(os.dup(pipe[0])) as commands:
         stdin(commands)
-        runtime = Told()
+        done = []
+
+        def zero(name=None, *, force=False):
+            done.append((name, force))
+
+        runtime = SimpleNamespace(reset=lambda: done.append("reset"), zero=zero)
         with user_commands() as everything:
             os.write(pipe[1], b'nonsense\n{"cmd": "reset"}\n{"cmd": "zero", "sensor": "4", "force": true}\n')
             os.kill(os.getpid(), signal.SIGUSR1)
             deadline_s = time.monotonic() + 20
-            while len(runtime.done) < 3 and time.monotonic() < deadline_s:  # a thread reads stdin
+            while len(done) < 3 and time.monotonic() < deadline_s:  # a thread reads stdin
                 for command in everything.poll():
                     command.carry_out(runtime)
             assert everything.refused == 1
-    runtime.done.remove((None, False))  # the signal's, which may come between those of stdin
-    assert runtime.done == ["reset", ("4", True)]
+    done.remove((None, False))  # the signal's, which may come between those of stdin
+    assert done == ["reset", ("4", True)]
 
 
 TIMEOUT_S = 60.0
@@ -171,17 +163,6 @@ class Terminal:
         self.type(shlex.join(command) + "\n")
         self.until(lambda: not self.line_mode() and self.records.exists() and self.records.stat().st_size > 0)
 
-    def wait_for(self, *texts):
-        """Read until one of the texts is shown; it, and what was before, is taken."""
-        end_s = time.monotonic() + TIMEOUT_S
-        while not any(text.encode() in self.shown for text in texts):
-            if not select.select([self.leader], [], [], max(end_s - time.monotonic(), 0))[0]:
-                raise AssertionError(f"waited for {texts}, saw {self.shown[-600:]!r}")
-            self.shown += os.read(self.leader, 65536)
-        cut = min(self.shown.index(t.encode()) + len(t) for t in texts if t.encode() in self.shown)
-        taken, self.shown = self.shown[:cut], self.shown[cut:]
-        return taken.decode(errors="replace")
-
     def type(self, text):
         os.write(self.leader, text.encode())
 
@@ -198,9 +179,8 @@ class Terminal:
                 self.shown += os.read(self.leader, 65536)
 
     def events(self):
-        lines = self.records.read_text().splitlines() if self.records.exists() else []
-        found = [json.loads(line)["event"] for line in lines if line.endswith("}")]
-        return [event for event in found if event]
+        lines = self.records.read_text().splitlines()
+        return [event for line in lines if line.endswith("}") and (event := json.loads(line)["event"])]
 
     def close(self):
         with contextlib.suppress(OSError):
@@ -225,7 +205,7 @@ def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     terminal.until(lambda: any("zeroed on demand" in event for event in terminal.events()))
 
     terminal.type("\x1a")  # Ctrl-Z
-    terminal.wait_for("Stopped")
+    terminal.until(lambda: b"Stopped" in terminal.shown)
     assert terminal.line_mode()
     terminal.type("fg\n")
     terminal.until(lambda: not terminal.line_mode())
@@ -234,7 +214,7 @@ def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     terminal.until(lambda: len(terminal.events()) > before)
 
     terminal.type("\x1a")
-    terminal.wait_for("Stopped")
+    terminal.until(lambda: terminal.shown.count(b"Stopped") == 2)
     size = terminal.records.stat().st_size
     terminal.type("bg\n")
     terminal.until(lambda: terminal.records.stat().st_size > size + 50_000)
@@ -244,4 +224,5 @@ def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     terminal.type("\x03")  # Ctrl-C
     terminal.until(terminal.line_mode)
     terminal.type("echo ended by $?.\n")
-    assert "scans, " in terminal.wait_for("ended by 0.")
+    terminal.until(lambda: b"ended by 0." in terminal.shown)
+    assert b"scans, " in terminal.shown

@@ -18,28 +18,27 @@ from edge.cli import main as cli
 from edge.terminal.progress_bar import progress
 
 
-class Terminal:
-    """Both ends of a pseudo-terminal; ours is never waited for."""
+@pytest.fixture
+def terminal():
+    """Both ends of a pseudo-terminal of 80 columns; ours is never waited for."""
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    os.set_blocking(ours, False)
 
-    def __init__(self, columns):
-        self.ours, theirs = os.openpty()
-        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
-        os.set_blocking(self.ours, False)
-        self.stream = os.fdopen(theirs, "w")
-
-    def said(self):
+    def said():
         said = b""
-        with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(OSError):
             while True:
-                said += os.read(self.ours, 1 << 16)
+                said += os.read(ours, 1 << 16)
         return said.decode()
 
-    def close(self):
-        if self.ours is not None:
-            os.close(self.ours)
-            self.ours = None
-        with contextlib.suppress(OSError):  # what is left for a window that was closed
-            self.stream.close()
+    stream = os.fdopen(theirs, "w")
+    made = SimpleNamespace(ours=ours, stream=stream, said=said)
+    yield made
+    with contextlib.suppress(OSError):  # what is left for a window that was closed
+        stream.close()
+    if made.ours is not None:
+        os.close(ours)
 
 
 @pytest.mark.parametrize("options", [[], ["--sink", "status"], ["--paced"]])
@@ -54,13 +53,6 @@ def test_a_replay_shows_the_live_line(tmp_path, monkeypatch, capfd, terminal, op
     assert written.count("\n") == 7
     lives = "--sink" in options or to != "-"  # else records may go to the same terminal
     assert ("REPLAY | " in terminal.said()) == lives
-
-
-@pytest.fixture
-def terminal():
-    made = Terminal(80)
-    yield made
-    made.close()
 
 
 @pytest.fixture
