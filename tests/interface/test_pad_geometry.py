@@ -1,6 +1,7 @@
 """A pad of 4 x 6 taxels, from bytes to pattern, and into what is written of it."""
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -29,46 +30,26 @@ REST_SCANS, SCANS = 20, 60
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    """Scans at rest, then a press on one taxel of the third row."""
-    rng = np.random.default_rng(0)
-    counts = REST + rng.integers(-2, 3, (SCANS, *REST.shape)).astype(np.int32)
-    for taxel, size in ((PRESSED, 4000), (PRESSED - 1, 400), (PRESSED - 6, 400)):  # a taxel alone would be a fault
-        counts[REST_SCANS:, 2].reshape(-1, 24)[:, taxel] += size
-    path = tmp_path_factory.mktemp("pad") / "pad.npz"
-    return Recording(path, (Track("4", counts, None),), 100.0)
-
-
-@pytest.fixture(scope="module")
 def model(tmp_path_factory):
     return write_model(tmp_path_factory.mktemp("model") / "pad46.onnx", CONTRACT)
 
 
-@pytest.fixture(scope="module")
-def folder(recording, model, tmp_path_factory):
-    """Files that a run over a pseudo-terminal wrote, and its results."""
-    folder, loaded = tmp_path_factory.mktemp("out"), api.load_model(model)
+def test_bytes_become_patterns_of_the_pads_own_shape_and_files_of_it(model, tmp_path):
+    """Scans at rest, then a press on one taxel of the third row, over a pseudo-terminal, and played again."""
+    counts = REST + np.random.default_rng(0).integers(-2, 3, (SCANS, *REST.shape)).astype(np.int32)
+    for taxel, size in ((PRESSED, 4000), (PRESSED - 1, 400), (PRESSED - 6, 400)):  # a taxel alone would be a fault
+        counts[REST_SCANS:, 2].reshape(-1, 24)[:, taxel] += size
+    recording, results = Recording(tmp_path / "pad.npz", (Track("4", counts, None),), 100.0), []
     with (
         Emulator([recording]) as emulator,
         api.open_source(f"slcan:{emulator.port}", id_map="uSPa46", give_up_s=0) as source,
     ):
-        runtime = api.open_runtime(loaded, source, baselines={"4": BASELINE})
-        sinks = [api.open_sink(f"{form}:{folder}/out.{form}", CONTRACT, source) for form in ("jsonl", "mcap")]
-        results = []
-        try:
-            for result in Stream(source, runtime):
-                results.append(result)
-                for sink in sinks:
-                    sink.write(result, {})
-        except api.LinkLostError:
-            pass
+        runtime = api.open_runtime(api.load_model(model), source, baselines={"4": BASELINE})
+        sinks = [api.open_sink(f"{form}:{tmp_path}/out.{form}", CONTRACT, source) for form in ("jsonl", "mcap")]
+        with suppress(api.LinkLostError):
+            results.extend(Stream(source, runtime, sinks=sinks))
         for sink in sinks:
             sink.close()
-    return folder, results
-
-
-def test_bytes_become_patterns_of_the_pads_own_shape(folder):
-    _, results = folder
     assert len(results) == SCANS
     assert all(result.scan.counts.shape == (3, 4, 6) and result.scan.complete for result in results)
     states = [result.state for result in results]
@@ -83,25 +64,19 @@ def test_bytes_become_patterns_of_the_pads_own_shape(folder):
         assert result.area_mm2 == pytest.approx(7.25**2, rel=0.01)
         assert result.centroid_mm == pytest.approx((2.5 * 7.25, 0.5 * 7.25), abs=0.3)
 
-
-def test_what_is_written_has_the_shape_of_the_pad(folder):
-    out, results = folder
-    records = [json.loads(line) for line in (out / "out.jsonl").read_text().splitlines()]
-    assert np.array(records[0]["counts"]).shape == (3, 4, 6) and records[0]["fresh"] == (1 << 24) - 1
-    arrays = arrays_of(out / "out.mcap")
+    record = json.loads((tmp_path / "out.jsonl").read_text().partition("\n")[0])
+    assert np.array(record["counts"]).shape == (3, 4, 6) and record["fresh"] == (1 << 24) - 1
+    arrays = arrays_of(tmp_path / "out.mcap")
     assert arrays["counts"].shape == (SCANS, 3, 4, 6) and arrays["pattern"].shape == (SCANS, 40, 60)
-    (track,) = load_recording(out / "out.mcap").tracks
+    (track,) = load_recording(tmp_path / "out.mcap").tracks
     assert track.geometry == USPA46
     assert np.array_equal(track.counts, np.array([result.scan.counts for result in results]))
-
-
-def test_a_recording_is_played_as_the_pad_it_is_of(folder, model):
-    out, results = folder
-    with api.open_recording(out / "out.mcap") as source:
+    with api.open_recording(tmp_path / "out.mcap") as source:
         again = list(Stream(source, api.open_runtime(model, source)))
-    assert len(again) == SCANS
-    np.testing.assert_allclose(again[-1].pattern, results[-1].pattern, atol=0.01)  # of 4: it may be of the scan before
-    with api.open_recording(out / "out.mcap") as source, pytest.raises(ModelError) as refused:
+        assert len(again) == SCANS
+        # Of 4: it may be of the scan before.
+        np.testing.assert_allclose(again[-1].pattern, results[-1].pattern, atol=0.01)
+    with api.open_recording(tmp_path / "out.mcap") as source, pytest.raises(ModelError) as refused:
         api.open_runtime("stsr-small-int8", source)
     line = str(refused.value)
     assert "\n" not in line and "a uSPa44 of 4 x 4 taxels, the sensor is a uSPa46 of 4 x 6" in line
@@ -157,8 +132,8 @@ def test_what_is_of_another_grid_is_refused_by_the_runtime(model):
 
 
 def test_a_recording_may_name_another_pad_than_its_scans_have(tmp_path):
-    rows = [",".join(csv_header(24)), ",".join(["1000"] * 72), ",".join(["1000"] * 72), ""]
-    (tmp_path / "4.csv").write_text("\n".join(rows))
+    row = ",".join(["1000"] * 72)
+    (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(24)), row, row, ""]))
     (track,) = load_recording(tmp_path / "4.csv").tracks
     assert track.geometry == USPA46
     (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(20)), ""]))
