@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -33,38 +32,30 @@ FREE_SCANS = 110
 TAP_SCANS = 40
 
 
-@dataclass(frozen=True)
-class Press:
-    """Round press: its place and radius in [mm], the z of its strongest taxel in [counts], and its drag along x."""
+def readings(x_mm: float, y_mm: float, radius_mm: float, counts: float, drag: float = 0.0) -> np.ndarray:
+    """Return what a round press adds to the counts of the pad, (3, 4, 4), x right and y down.
 
-    x_mm: float
-    y_mm: float
-    radius_mm: float
-    counts: float
-    drag: float = 0.0
-
-    def readings(self) -> np.ndarray:
-        """Return what it adds to the counts of the pad, (3, 4, 4), x right and y down."""
-        x, y = np.meshgrid(PLACES_MM - self.x_mm, PLACES_MM - self.y_mm)
-        # The layer spreads a load by its thickness, and pushes material outwards at the edge of a contact.
-        spread = self.radius_mm**2 + 3.0**2
-        z = self.counts * np.exp(-(x**2 + y**2) / spread)
-        return np.stack([z * (0.12 * x + self.drag), z * 0.12 * y, z])
+    `counts` is the z of its strongest taxel, and `drag` its drag along x.
+    """
+    x, y = np.meshgrid(PLACES_MM - x_mm, PLACES_MM - y_mm)
+    # The layer spreads a load by its thickness, and pushes material outwards at the edge of a contact.
+    z = counts * np.exp(-(x**2 + y**2) / (radius_mm**2 + 3.0**2))
+    return np.stack([z * (0.12 * x + drag), z * 0.12 * y, z])
 
 
 PRESSES = (
-    Press(0.0, 0.0, 5.0, 700),
-    Press(2.0, -3.0, 4.0, 900, drag=0.3),
-    Press(-4.0, 4.0, 6.0, 600),
-    Press(1.0, 1.0, 3.0, 1100, drag=-0.2),
+    readings(0.0, 0.0, 5.0, 700),
+    readings(2.0, -3.0, 4.0, 900, drag=0.3),
+    readings(-4.0, 4.0, 6.0, 600),
+    readings(1.0, 1.0, 3.0, 1100, drag=-0.2),
 )
 
 
-def pressed(presses: Sequence[Press] = PRESSES, *, seed: int = 1, free: int = FREE_SCANS) -> np.ndarray:
+def pressed(presses: Sequence[np.ndarray] = PRESSES, *, seed: int = 1) -> np.ndarray:
     """Return the counts (n, 3, 4, 4) of a free pad and of taps, each pressed, held and released."""
     force = np.concatenate([np.linspace(0, 1, 8), np.ones(12), np.linspace(1, 0, 8), np.zeros(TAP_SCANS - 28)])
-    taps = [force[:, None, None, None] * press.readings() for press in presses]
-    made = np.concatenate([np.zeros((free, 3, 4, 4)), *taps])
+    taps = [force[:, None, None, None] * press for press in presses]
+    made = np.concatenate([np.zeros((FREE_SCANS, 3, 4, 4)), *taps])
     noise = np.random.default_rng(seed).normal(0, 2, made.shape)
     return np.rint(REST + made + noise).astype(np.int32)
 
@@ -90,10 +81,14 @@ def scene(make: Callable[[Path], Outcome]) -> Callable[[Path], Outcome]:
     return make
 
 
+def replayed(folder: Path, name: str, counts: np.ndarray, *words: object, rate_hz: int = 100) -> Outcome:
+    write_csv(folder / f"{name}.csv", counts)
+    return edge_sr(folder, "replay", f"{name}.csv", "--rate-hz", rate_hz, *words, *RECORDS)
+
+
 @scene
 def csv_replay(folder: Path) -> Outcome:
-    write_csv(folder / "press.csv", pressed())
-    return edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, *MODEL, *RECORDS)
+    return replayed(folder, "press", pressed(), *MODEL)
 
 
 @scene
@@ -104,15 +99,13 @@ def simulated_taps(folder: Path) -> Outcome:
 
 @scene
 def several_taps(folder: Path) -> Outcome:
-    write_csv(folder / "press.csv", pressed([PRESSES[0]] * 4))
-    return edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, "--model", "mtsr4", *RECORDS)
+    return replayed(folder, "press", pressed([PRESSES[0]] * 4), "--model", "mtsr4")
 
 
 @scene
 def chosen_fields_and_thresholds(folder: Path) -> Outcome:
-    write_csv(folder / "press.csv", pressed())
     fields = ("--fields", "force_n,area_mm2", "--counts-per-newton", 1180, "--contact-on-counts", 4000)
-    return edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, *fields, *MODEL, *RECORDS)
+    return replayed(folder, "press", pressed(), *fields, *MODEL)
 
 
 @scene
@@ -143,14 +136,12 @@ def hand(folder: Path) -> Outcome:
 
 @scene
 def begins_in_a_grip(folder: Path) -> Outcome:
-    write_csv(folder / "grip.csv", gripped())
-    return edge_sr(folder, "replay", "grip.csv", "--rate-hz", 60, *MODEL, *RECORDS)
+    return replayed(folder, "grip", gripped(), *MODEL, rate_hz=60)
 
 
 @scene
 def never_free(folder: Path) -> Outcome:
-    write_csv(folder / "grip.csv", gripped(free=0)[:-10])
-    return edge_sr(folder, "replay", "grip.csv", "--rate-hz", 60, *MODEL, *RECORDS)
+    return replayed(folder, "grip", gripped(free=0)[:-10], *MODEL, rate_hz=60)
 
 
 @scene
@@ -159,10 +150,11 @@ def old_baseline(folder: Path) -> Outcome:
     fallen = np.rint(np.random.default_rng(5).normal([[[60]], [[-20]], [[-500]]], 70, (3, 4, 4))).astype(np.int32)
     (folder / "earlier").mkdir()
     write_csv(folder / "earlier" / "press.csv", pressed(()))
-    write_csv(folder / "press.csv", pressed() - fallen)
     zeroed = edge_sr(folder, "baseline", "--source", "replay:earlier/press.csv", "--rate-hz", 100, "--out", "zero.json")
-    played = edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, "--baseline", "zero.json", *MODEL, *RECORDS)
-    return {"zeroed": zeroed, "played": played}
+    return {
+        "zeroed": zeroed,
+        "played": replayed(folder, "press", pressed() - fallen, "--baseline", "zero.json", *MODEL),
+    }
 
 
 @scene
@@ -182,8 +174,7 @@ def extreme_counts(folder: Path) -> Outcome:
     counts = pressed()
     counts[FREE_SCANS + 5, 2] = 65_535
     counts[FREE_SCANS + 6, :, 1, 1] = 0
-    write_csv(folder / "extreme.csv", counts)
-    return edge_sr(folder, "replay", "extreme.csv", "--rate-hz", 100, *MODEL, *RECORDS)
+    return replayed(folder, "extreme", counts, *MODEL)
 
 
 @scene
@@ -205,17 +196,14 @@ def commands_and_poses(folder: Path) -> Outcome:
             if number == FREE_SCANS + 120:
                 runtime.reset()
             results.append(result)
-    kept = [
-        {"sensor": one.scan.sensor, "scan": one.scan.number, "event": one.event, "note": one.note, **of(one)}
-        for one in results
-    ]
-    return short(kept)
+    return short(list(map(record_of, results)))
 
 
-def of(result: Any) -> dict[str, Any]:
-    kept = {name: getattr(result, name) for name in ("state", "contact", "taps_used", "force_counts", "trusted")}
-    kept["next_tap"] = None if result.next_tap is None else [result.next_tap.dx_mm, result.next_tap.dy_mm]
-    return kept | {"pattern": None if result.pattern is None else result.pattern.tolist()}
+def record_of(result: Any) -> dict[str, Any]:
+    kept = ("state", "contact", "taps_used", "force_counts", "trusted", "event", "note")
+    record = {"sensor": result.scan.sensor, "scan": result.scan.number} | {name: getattr(result, name) for name in kept}
+    record["next_tap"] = None if result.next_tap is None else [result.next_tap.dx_mm, result.next_tap.dy_mm]
+    return record | {"pattern": None if result.pattern is None else result.pattern.tolist()}
 
 
 class Adapter(SlcanAdapter):

@@ -13,14 +13,6 @@ from types import ModuleType
 from typing import Any, ClassVar
 
 
-class DeviceNotConnectedError(ConnectionError):
-    """A call that needs an open device."""
-
-
-class DeviceAlreadyConnectedError(ConnectionError):
-    """A second connect."""
-
-
 @dataclass(kw_only=True)
 class CameraConfig:
     """Settings of a camera, known by the word that it was registered with."""
@@ -96,10 +88,9 @@ def install(monkeypatch) -> None:
         "lerobot.cameras.configs": {"CameraConfig": CameraConfig},
         "lerobot.cameras.utils": {"make_cameras_from_configs": make_cameras_from_configs},
         "lerobot.utils": {},
-        "lerobot.utils.errors": {
-            "DeviceNotConnectedError": DeviceNotConnectedError,
-            "DeviceAlreadyConnectedError": DeviceAlreadyConnectedError,
-        },
+        "lerobot.utils.errors": dict.fromkeys(
+            ("DeviceNotConnectedError", "DeviceAlreadyConnectedError"), ConnectionError
+        ),
         "lerobot.utils.import_utils": {"register_third_party_plugins": register_third_party_plugins},
     }
     for name, content in parts.items():
