@@ -1,5 +1,7 @@
 """Effects of a sensor file on a run, and options that take precedence."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from bridge_samples import write_recording as write_counts
@@ -53,11 +55,11 @@ PAD = Pad(thickness_mm=5.0, gains=tuple(np.linspace(0.5, 2, 48).tolist()))
 def test_a_pad_goes_from_the_file_into_every_runtime(pressed, tmp_path):
     path = tmp_path / "pad.toml"
     save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, pad=PAD)}))
-    recording, other = pressed.removeprefix("replay:"), Pad(thickness_mm=4.0)
-    for opened in (lambda: open_source(pressed, sensor=path), lambda: open_recording(recording, sensor=path)):
+    other = Pad(thickness_mm=4.0)
+    for opened in (partial(open_source, pressed), partial(open_recording, pressed.removeprefix("replay:"))):
         for settings, expected in (({}, PAD), ({"pad": other}, other), ({"pad": {}}, None)):
             model = FakeModel(make_pad_contract())
-            with opened() as source:
+            with opened(sensor=path) as source:
                 results = Stream(source, open_runtime(model, source, **settings))
                 # A replay keeps the recording's time: a scan that waited while the runtime was made may be dropped.
                 assert next(result for result in results if result.state != "dropped").state == "contact"
@@ -95,11 +97,6 @@ def test_options_go_before_the_file_but_for_another_id_map(file, pressed, tmp_pa
         open_source(pressed, id_map="C")
 
 
-def turned_rest():
-    """Return the readings of the free pad where its taxels lie, (3, 4, 4)."""
-    return REST.reshape(3, 16)[:, list(TURNED.order)].reshape(3, 4, 4)
-
-
 def test_named_sources_are_put_in_place_each_by_its_own(tmp_path):
     """Sensor 4 of left and sensor 4 of right may sit in other ways."""
     for folder in ("left", "right"):
@@ -110,4 +107,5 @@ def test_named_sources_are_put_in_place_each_by_its_own(tmp_path):
     with Source(*open_sources(texts, 100.0, mountings={"left/4": TURNED, "4": Mounting(AS_MAPPED[::-1])})) as source:
         while (taken := source.take(0.2)) is not None:
             found |= {one.sensor: one.counts for one in taken if isinstance(one, Scan)}
-    assert np.array_equal(found["left/4"], turned_rest()) and np.array_equal(found["right/4"], REST)
+    turned = REST.reshape(3, 16)[:, list(TURNED.order)].reshape(3, 4, 4)  # where its taxels lie
+    assert np.array_equal(found["left/4"], turned) and np.array_equal(found["right/4"], REST)

@@ -19,12 +19,11 @@ DRIFT[2] = 560 + 90 * np.cos(np.arange(16)).reshape(4, 4)
 DRIFT[0] = -110
 
 
-def write_parts(path, *parts, seed=0):
+def write_parts(path, *parts):
     """Write a recording of (scans, counts over rest) parts, as the vendor's logger does, without times."""
     felt = np.array([felt + np.zeros((3, 4, 4)) for scans, felt in parts for _ in range(scans)])
-    return write_recording(
-        path, np.rint(REST + felt + np.random.default_rng(seed).normal(0, 2, felt.shape)).astype(int)
-    )
+    noise = np.random.default_rng(0).normal(0, 2, felt.shape)
+    return write_recording(path, np.rint(REST + felt + noise).astype(int))
 
 
 def moving(scans):
@@ -52,11 +51,10 @@ def test_the_printed_remedy_for_a_recording_of_a_held_pad_works(folder):
     shown, stderr = played(folder, held, "--rate-hz", "60")
     assert not any(one["contact"] or one["trusted"] for one in shown) and {one["state"] for one in shown} != {"idle"}
     first, second = re.findall(r"edge-sr ((?:baseline|replay) .*?)(?:;| shows)", stderr)
-    words = shlex.split(first.replace("OTHER", str(released)).replace("zero.json", str(folder / "zero.json")))
-    done = run(*words)
+    zero = str(folder / "zero.json")
+    done = run(*shlex.split(first.replace("OTHER", str(released)).replace("zero.json", zero)))
     assert done.returncode == 0, done.stderr
-    words = shlex.split(second.replace("zero.json", str(folder / "zero.json")))
-    shown, _ = played(folder, *words[1:])
+    shown, _ = played(folder, *shlex.split(second.replace("zero.json", zero))[1:])
     assert {one["state"] for one in shown} == {"baseline_in_doubt"} and not any(one["trusted"] for one in shown)
     assert all(one["pattern"] is not None for one in shown)
     shown, _ = played(folder, released, "--rate-hz", "60")

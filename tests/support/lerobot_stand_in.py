@@ -15,13 +15,11 @@ from typing import Any, ClassVar
 
 @dataclass(kw_only=True)
 class CameraConfig:
-    """Settings of a camera, known by the word that it was registered with."""
-
     fps: int | None = None
     width: int | None = None
     height: int | None = None
 
-    words: ClassVar[dict[type, str]] = {}
+    words: ClassVar[dict[type, str]] = {}  # by which classes were registered
 
     @classmethod
     def register_subclass(cls, word: str):
@@ -37,8 +35,6 @@ class CameraConfig:
 
 
 class Camera(abc.ABC):
-    """Interface of every camera."""
-
     def __init__(self, config: CameraConfig) -> None:
         self.fps, self.width, self.height = config.fps, config.width, config.height
 
