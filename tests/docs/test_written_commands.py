@@ -83,7 +83,7 @@ PARSED = {
     r"python tests/system/chaos\.py .*": "takes minutes; test_chaos runs it, shortened",
     r"python tests/support/tapping_robot\.py .*": "taps for a minute; test_own_taps runs it by night",
     r"python tests/system/chaos_wire\.py .*": "plays until ended; test_chaos runs it",
-    r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
+    r"python tests/system/mutation_survey\.py.*": "takes an hour; test_chaos runs it on a part",
     r"python tests/system/program_cost\.py.*": "takes a minute; test_bench runs it, shortened",
     r"edge-sr (record |replay |--source replay:)FILE(\.\.\.)?( --view)?": "a name to be filled in; press.mcap is run",
     r"edge-sr replay --example --view": "waits for who looks; test_view_page_recordings looks at a recording",

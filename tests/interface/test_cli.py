@@ -1,10 +1,14 @@
-"""`edge-sr` as a user runs it: help, recordings, models, baselines, refusals; signals, and streams closed or full."""
+"""`edge-sr` as a user runs it: help, recordings, models, baselines, refusals; signals, and streams closed or full.
+
+At the end: recordings whose pad is held or only recovers, where they are zeroed, and the remedy that is printed.
+"""
 
 import json
 import os
 import pty
 import re
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -15,8 +19,9 @@ import numpy as np
 import pytest
 from bridge_samples import write_recording as write_counts
 from cli_samples import EDGE_SR, TIMEOUT_S, assert_refused, base_options, files, records, run, start, write_recording
-from edge_samples import BASELINE, ROOT, make_contract, wait_for, write_model
+from edge_samples import BASELINE, REST, ROOT, make_contract, wait_for, write_model
 
+from edge.api import open_recording, take_baselines
 from edge.cli import listings
 from edge.cli import main as cli
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -86,7 +91,7 @@ def there(tmp_path):
 
 
 KNOWN = "--model {files}/tiny.onnx --baseline {files}/zero.json"
-REST = "--source replay:{files}/rest.npz"
+AT_REST = "--source replay:{files}/rest.npz"
 MAP = "map --source replay:none.npz --out"
 NONE = "replay none.npz --model none"
 ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
@@ -109,7 +114,7 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (3, f"{KNOWN} --source slcan:serial=NOSUCH", ["NOSUCH"]),
         (2, f"{ZERO}{{files}}/rest.npz --out {{tmp}}/other.onnx", ["other.onnx holds something else: give another"]),
         (3, f"{ZERO}{{tmp}}/moving.npz", ["nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by"]),
-        (4, f"{REST} --model {{tmp}}/other.onnx", ["'pitch_mm' is 5.0", "4.7"]),
+        (4, f"{AT_REST} --model {{tmp}}/other.onnx", ["'pitch_mm' is 5.0", "4.7"]),
         (2, f"{NONE} --sink jsonl:- --fields force_n,patern", ["no field 'patern'", "did you mean pattern?"]),
         (2, f"{NONE} --fields force_n", ["--fields requires a sink of JSON records"]),
         (2, f"{NONE} --sink jsonl:a --sink mcap:a.mcap --sink jsonl:./a", ["'jsonl:a' and 'jsonl:./a' write to the"]),
@@ -314,3 +319,73 @@ def test_fewer_descriptors_than_a_run_needs_end_in_one_line():
     errors = process.communicate(timeout=TIMEOUT_S)[1]
     assert process.returncode == 5 and "Traceback" not in errors
     assert errors.splitlines()[-1] == "edge-sr: Too many open files: allow more of them, ulimit -n 256"
+
+
+GRIP = np.zeros((3, 4, 4))
+GRIP[2] = np.linspace(400, 1100, 16).reshape(4, 4)
+DRIFT = np.zeros((3, 4, 4))
+DRIFT[2] = 560 + 90 * np.cos(np.arange(16)).reshape(4, 4)
+DRIFT[0] = -110
+
+
+def write_parts(path, *parts):
+    """Write a recording of (scans, counts over rest) parts, as the vendor's logger does, without times."""
+    felt = np.array([felt + np.zeros((3, 4, 4)) for scans, felt in parts for _ in range(scans)])
+    noise = np.random.default_rng(0).normal(0, 2, felt.shape)
+    return write_counts(path, np.rint(REST + felt + noise).astype(int))
+
+
+def moving(scans):
+    """Parts of a grip that moves all the time, as real ones do."""
+    return [(1, GRIP * (1 + 0.04 * np.sin(number / 3))) for number in range(scans)]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_model(tmp_path / "tiny.onnx")
+    (tmp_path / "monday").mkdir()
+    (tmp_path / "tuesday").mkdir()
+    return tmp_path
+
+
+def played(folder, *arguments):
+    done = run("replay", *arguments, "--model", folder / "tiny.onnx", "--sink", "jsonl:-")
+    assert done.returncode == 0, done.stderr
+    return [one for one in records(done.stdout) if one["state"] != "event"], done.stderr
+
+
+def test_the_printed_remedy_for_a_recording_of_a_held_pad_works(folder):
+    held = write_parts(folder / "monday" / "left.csv", *moving(150))
+    released = write_parts(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
+    shown, stderr = played(folder, held, "--rate-hz", "60")
+    assert not any(one["contact"] or one["trusted"] for one in shown) and {one["state"] for one in shown} != {"idle"}
+    first, second = re.findall(r"edge-sr ((?:baseline|replay) .*?)(?:;| shows)", stderr)
+    zero = str(folder / "zero.json")
+    done = run(*shlex.split(first.replace("OTHER", str(released)).replace("zero.json", zero)))
+    assert done.returncode == 0, done.stderr
+    shown, _ = played(folder, *shlex.split(second.replace("zero.json", zero))[1:])
+    assert {one["state"] for one in shown} == {"baseline_in_doubt"} and not any(one["trusted"] for one in shown)
+    assert all(one["pattern"] is not None for one in shown)
+    shown, _ = played(folder, released, "--rate-hz", "60")
+    assert {one["state"] for one in shown[:89]} == {"contact"} and {one["state"] for one in shown[95:]} == {"idle"}
+
+
+def test_a_recordings_baseline_has_no_age_and_the_former_stays(folder):
+    path, zero = write_parts(folder / "left.csv", (120, 0)), folder / "zero.json"
+    zero.write_text('{"format": "tactile-baseline"}')
+    done = run("baseline", "--source", f"replay:{path}", "--rate-hz", "600", "--out", zero)
+    assert done.returncode == 0 and f"the former file is now {zero}.bak" in done.stdout, done.stderr
+    assert (folder / "zero.json.bak").read_text() == '{"format": "tactile-baseline"}'
+    assert json.loads(zero.read_text())["baselines"][0]["created_unix_s"] is None
+    assert np.isnan(load_baselines(zero)["left"].created_unix_s)
+    with open_recording(path, rate_hz=60) as source:
+        assert np.isnan(take_baselines(source)["left"].created_unix_s)
+
+
+def test_a_pad_that_only_recovers_gives_patterns(folder):
+    falls = [(1, GRIP * share) for share in (0.8, 0.5, 0.2)]
+    recovers = [(1, np.array([0, 0, 30.0 * (1 - n / 35)])[:, None, None]) for n in range(36)]
+    path = write_parts(folder / "left.csv", *moving(20), *falls, *recovers)
+    shown, stderr = played(folder, path, "--rate-hz", "60")
+    assert {one["state"] for one in shown[:21]} == {"contact"} and {one["state"] for one in shown[26:]} == {"idle"}
+    assert re.search(r"pressed least; it recovers there: a taxel may be off by \d+ counts", stderr)

@@ -1,12 +1,20 @@
-"""Commands on stdin, by signals, and as keys on a real terminal: every way out leaves the terminal as it was."""
+"""Commands on stdin, by signals, and as keys on a real terminal: every way out leaves the terminal as it was.
+
+And bars on a real pseudo-terminal, none anywhere else; commands of advice.
+"""
 
 import contextlib
+import fcntl
+import io
 import json
 import os
 import pty
+import re
 import select
 import shlex
 import signal
+import struct
+import subprocess
 import sys
 import termios
 import time
@@ -15,10 +23,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bridge_samples import make_counts
+from bridge_samples import write_recording as write_counts
 from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, wait_for, write_model
 
+from edge.cli import main as cli
 from edge.pipeline.commands import RESET, Command, Commands, command_lines, read_stdin, user_commands
+from edge.terminal.progress_bar import progress
 from firmware_bridge.zeroing.baseline import save_baselines
 
 OPEN = contextlib.ExitStack()
@@ -226,3 +238,99 @@ def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     terminal.type("echo ended by $?.\n")
     terminal.until(lambda: b"ended by 0." in terminal.shown)
     assert b"scans, " in terminal.shown
+
+
+@pytest.fixture
+def window():
+    """Both ends of a pseudo-terminal of 80 columns; ours is never waited for."""
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    os.set_blocking(ours, False)
+
+    def said():
+        said = b""
+        with contextlib.suppress(OSError):
+            while True:
+                said += os.read(ours, 1 << 16)
+        return said.decode()
+
+    stream = os.fdopen(theirs, "w")
+    made = SimpleNamespace(ours=ours, stream=stream, said=said)
+    yield made
+    with contextlib.suppress(OSError):  # what is left for a window that was closed
+        stream.close()
+    if made.ours is not None:
+        os.close(ours)
+
+
+@pytest.mark.parametrize("options", [[], ["--sink", "status"], ["--paced"]])
+@pytest.mark.parametrize("to", ["-", "out.jsonl"])
+def test_a_replay_shows_the_live_line(tmp_path, monkeypatch, capfd, window, options, to):
+    monkeypatch.chdir(tmp_path)
+    write_model(tmp_path / "tiny.onnx")
+    path = write_counts(tmp_path / "finger.csv", make_counts(7), rate_hz=1000)
+    with contextlib.redirect_stderr(window.stream):
+        assert cli.main(["replay", str(path), "--model", "tiny.onnx", "--sink", f"jsonl:{to}", *options]) == 0
+    written = capfd.readouterr().out if to == "-" else (tmp_path / to).read_text()
+    assert written.count("\n") == 7
+    lives = "--sink" in options or to != "-"  # else records may go to the same terminal
+    assert ("REPLAY | " in window.said()) == lives
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Clock of the bars, which goes on as a test sets `now_s`."""
+    clock = SimpleNamespace(now_s=100.0)
+    monkeypatch.setattr("tqdm.std.time", lambda: clock.now_s)
+    return clock
+
+
+def test_a_bar_comes_after_two_seconds_and_leaves_no_trace(window, clock):
+    with progress("poses", 400, "pose", done=100, stream=window.stream) as bar:
+        clock.now_s += 1.9
+        bar.update(38)
+        assert window.said() == ""
+        clock.now_s += 0.1
+        bar.update(2)
+        shown = window.said()
+        assert re.search(r"^\r?poses:  35%\|.+20\.0pose/s", shown) and "\n" not in shown, shown
+        os.close(window.ours)  # a window that is closed ends no work
+        window.ours = None
+        bar.update()
+
+
+def test_nothing_without_a_terminal_or_beyond_torchruns_first(window, monkeypatch, clock):
+    pipe = io.StringIO()
+    for stream, rank in ((pipe, "0"), (window.stream, "1")):
+        monkeypatch.setenv("RANK", rank)
+        with progress("poses", 400, "pose", stream=stream) as bar:
+            clock.now_s += 9
+            bar.update()
+    assert pipe.getvalue() == window.said() == ""
+
+
+ODD = ["a  b", "it's;$c`d", "tab\there\nthere", "back\\slash\x1b", "\x9b\u202eé\udcff"]
+
+
+@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize(
+    ("command", "advice", "meant"),
+    [
+        (["record", "NAME.npz"], "cannot be recorded: ", ["NAME.mcap", "NAME.mcap", "NAME.npz"]),
+        (["--sink", "npz:NAME.npz"], ", then ", ["NAME.mcap", "NAME.npz"]),
+        (["--source", "NAME.csv"], "did you mean ", ["replay:NAME.csv"]),
+    ],
+)
+def test_commands_of_advice_can_be_typed_whatever_the_file(name, command, advice, meant, capsys):
+    """As bash takes it: its arguments that hold the name are those of the files."""
+    assert cli.main([word.replace("NAME", name) for word in command]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.isprintable()
+    typed = line.partition(advice)[2].removesuffix("?")
+    if not typed.startswith("edge-sr"):
+        typed = f"edge-sr {typed}"
+    script = 'edge-sr() { printf "%s\\0" "$@"; }; afterwards() { "$@"; }; ' + typed
+    bash = ["bash", "-c", script.encode(errors="surrogateescape")]
+    done = subprocess.run(bash, capture_output=True, check=True, env=os.environ | {"LC_ALL": "C.UTF-8"})
+    words = done.stdout.decode(errors="surrogateescape").split("\0")
+    assert [one for one in words if "." in one] == [one.replace("NAME", name) for one in meant]

@@ -1,11 +1,14 @@
-"""`edge-sr` among faults of the wire keeps its promises."""
+"""`edge-sr` among faults of the wire keeps its promises; and the survey of mutants."""
 
 import os
+import subprocess
+import sys
 
 import pytest
 from bridge_samples import make_recording
 from chaos import Chaos
 from chaos_wire import NAMES, FaultyBus, numbered, stretches
+from edge_samples import ROOT
 
 from firmware_bridge.emulation.pty_port import EmulatorThread
 from firmware_bridge.emulation.slcan_emulator import bus_timeline, controllers_of
@@ -56,3 +59,10 @@ def test_a_mixture_holds_every_fault_and_ends_in_calm():
     assert {one.name for one in found} == set(NAMES) and found[0].start_s >= 5
     assert max(one.end_s for one in found) <= 102
     assert found == stretches("mixed@5+100", seed=3) != stretches("mixed@5+100", seed=4)
+
+
+def test_a_survey_of_one_module_is_a_page():
+    """python tests/system/mutation_survey.py slcan --mutants 1"""
+    command = [sys.executable, "tests/system/mutation_survey.py", "slcan", "--mutants", "1"]
+    page = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert page.startswith("# ") and "firmware_bridge.can.slcan" in page
