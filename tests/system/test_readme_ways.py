@@ -32,45 +32,26 @@ def typed() -> list[str]:
     return [line for text in lines if (line := text.partition("  #")[0].strip())]
 
 
-class Terminal:
-    """A shell in the clone, which remembers the environment that was activated."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._activated = folder, ":"
-        self._variables = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-
-    def type(self, line: str) -> str:
-        """Run a line until it ends, or until it is at work and Ctrl-C; return what it printed.
-
-        Four minutes of training hand no model over, which is a 1.
-        """
-        if re.search(r"(^|&& )\. \S+/activate$", line):
-            made = self.run(f"{self._activated} && {line}")
-            self._activated = f". {line.rpartition('. ')[2]}"
-            return made
-        trains = "train_and_deploy.py" in line
-        shown = self.run(f"{self._activated} && {line}{'; test $? -le 1' if trains else ''}", ENDLESS.get(line))
-        assert not trains or "not handed over: " in shown or "from now on: " in shown
-        return shown
-
-    def run(self, command: str, at_work: str | None = None) -> str:
-        pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        with subprocess.Popen(
-            ["bash", "-c", command], cwd=self._folder, env=self._variables, start_new_session=True, text=True, **pipes
-        ) as process:
-            try:
-                shown = "".join(_until(process.stdout, at_work))
-                if at_work is not None:
-                    assert at_work in shown, f"{command} ended: {shown[-2000:]}"
-                    time.sleep(3)
-                    os.killpg(process.pid, signal.SIGINT)
-                rest, _ = process.communicate(timeout=LONGEST_S)
-            finally:
-                if process.poll() is None:
-                    os.killpg(process.pid, signal.SIGKILL)
-        allowed = {0} if at_work is None else {0, 130, -signal.SIGINT}
-        assert process.returncode in allowed, f"{command}: {(shown + rest)[-2000:]}"
-        return shown + rest
+def run(folder: Path, command: str, at_work: str | None = None) -> str:
+    """Run a command until it ends, or until it is at work and Ctrl-C; return what it printed."""
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(
+        ["bash", "-c", command], cwd=folder, env=variables, start_new_session=True, text=True, **pipes
+    ) as process:
+        try:
+            shown = "".join(_until(process.stdout, at_work))
+            if at_work is not None:
+                assert at_work in shown, f"{command} ended: {shown[-2000:]}"
+                time.sleep(3)
+                os.killpg(process.pid, signal.SIGINT)
+            rest, _ = process.communicate(timeout=LONGEST_S)
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+    allowed = {0} if at_work is None else {0, 130, -signal.SIGINT}
+    assert process.returncode in allowed, f"{command}: {(shown + rest)[-2000:]}"
+    return shown + rest
 
 
 def _until(lines, at_work: str | None) -> Iterator[str]:
@@ -86,11 +67,15 @@ def test_what_readme_types_works(tmp_path):
     clone, *lines = typed()
     assert clone == "git clone URL tactile && cd tactile" and len([line for line in lines if "edge-sr" in line]) >= 3
     subprocess.run(["git", "clone", "--quiet", "--no-hardlinks", ROOT, tmp_path / "tactile"], check=True)
-    terminal = Terminal(tmp_path / "tactile")
+    folder, activated = tmp_path / "tactile", ":"
     bolt = trimesh.creation.cylinder(radius=3.0, height=12.0) + trimesh.creation.cylinder(radius=5.0, height=3.0)
-    bolt.export(tmp_path / "tactile" / "bolt.stl")
+    bolt.export(folder / "bolt.stl")
     for line in lines:
         begun_s = time.monotonic()
-        shown = terminal.type(line)
+        trains = "train_and_deploy.py" in line  # four minutes of it hand no model over, which is a 1
+        shown = run(folder, f"{activated} && {line}{'; test $? -le 1' if trains else ''}", ENDLESS.get(line))
+        assert not trains or "not handed over: " in shown or "from now on: " in shown
+        if re.search(r"(^|&& )\. \S+/activate$", line):
+            activated = f". {line.rpartition('. ')[2]}"
         print(f"{time.monotonic() - begun_s:6.1f} s  {line}")
         assert "Traceback" not in shown, f"{line}: {shown[-2000:]}"
