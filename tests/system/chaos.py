@@ -206,12 +206,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seconds = 60 * options.minutes
     run = Chaos(16, 1, "" if options.calm else f"mixed@1+{seconds - 1:g}")
     broken = run.play(seconds)
-    for minute, mb, held, quiet_us in run.windows[:: max(1, len(run.windows) // 12)]:
-        print(f"minute {minute:.1f}: {mb:.1f} MB, {held} threads and descriptors, latency {quiet_us:.0f} us")
     slope, half = run.growth()
     print(
         f"{run.judge.records.total()} records, {run.judge.whole} whole, {run.judge.patterns} patterns; "
-        f"{run.faults.total()} faults of {len(run.faults)} kinds; memory {slope:+.3f} MB a minute (+- {half:.3f})"
+        f"{run.faults.total()} faults of {len(run.faults)} kinds; memory {slope:+.3f} MB a minute (+- {half:.3f}), "
+        f"{run.windows[-1][1]:.1f} MB; latency {run.latency_ratio():.2f} of the first third's"
     )
     print(", ".join(f"{name} {number}" for name, number in run.judge.counters.items() if number))
     print("\n".join(["broken:", *broken[:20]]) if broken else "every promise was kept")

@@ -54,13 +54,6 @@ def test_a_recording_is_played_among_faults_for_your_own_program(tmp_path):
     assert not all(scan.whole for scan in scans) and bus.begun == {"lost": 1}
 
 
-def test_a_mixture_holds_every_fault_and_ends_in_calm():
-    found = stretches("mixed@5+100", seed=3)
-    assert {one.name for one in found} == set(NAMES) and found[0].start_s >= 5
-    assert max(one.end_s for one in found) <= 102
-    assert found == stretches("mixed@5+100", seed=3) != stretches("mixed@5+100", seed=4)
-
-
 def test_a_survey_of_one_module_is_a_page():
     """python tests/system/mutation_survey.py slcan --mutants 1"""
     command = [sys.executable, "tests/system/mutation_survey.py", "slcan", "--mutants", "1"]
