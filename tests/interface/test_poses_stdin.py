@@ -12,16 +12,8 @@ from pose_samples import make_posed_contract
 
 from edge.api import PadPose, Runtime, Source, TimedPose, pump
 from edge.mapping.sink import check_npz
+from edge.pipeline import pose_queue
 from edge.pipeline.commands import Commands
-from edge.pipeline.pose_queue import (
-    FURTHEST_AHEAD_NS,
-    REPEATED_NS,
-    WAITING_POSES,
-    PoseError,
-    PoseIntake,
-    PoseQueue,
-    pose_of_fields,
-)
 from edge.pipeline.run_statistics import Statistics
 from firmware_bridge.schedule import SENSOR_SILENT_NS
 
@@ -35,9 +27,13 @@ NOW_NS = 10**12
 
 def test_all_fields_are_taken_and_place_alone_is_enough():
     expected = TimedPose(PadPose(1.5, 0.0, 5.0, 0.2, 1.0), 123, "4", True)
-    assert pose_of_fields(json.loads(WHOLE), NOW_NS) == expected
-    assert pose_of_fields({"cmd": "pose", "x_mm": 1, "y_mm": -2.0}, NOW_NS) == TimedPose(PadPose(1, -2), NOW_NS)
-    assert pose_of_fields({"x_mm": 0, "y_mm": 0, "time_ns": NOW_NS + FURTHEST_AHEAD_NS}, NOW_NS)  # a little ahead
+    assert pose_queue.pose_of_fields(json.loads(WHOLE), NOW_NS) == expected
+    assert pose_queue.pose_of_fields({"cmd": "pose", "x_mm": 1, "y_mm": -2.0}, NOW_NS) == TimedPose(
+        PadPose(1, -2), NOW_NS
+    )
+    assert pose_queue.pose_of_fields(
+        {"x_mm": 0, "y_mm": 0, "time_ns": NOW_NS + pose_queue.FURTHEST_AHEAD_NS}, NOW_NS
+    )  # a little ahead
 
 
 @pytest.mark.parametrize(
@@ -60,16 +56,16 @@ def test_all_fields_are_taken_and_place_alone_is_enough():
     ],
 )
 def test_a_field_that_is_wrong_is_named(fields, words):
-    with pytest.raises(PoseError, match=words.replace("[", r"\[")) as caught:
-        pose_of_fields(fields, NOW_NS)
+    with pytest.raises(pose_queue.PoseError, match=words.replace("[", r"\[")) as caught:
+        pose_queue.pose_of_fields(fields, NOW_NS)
     assert str(caught.value).isprintable() and len(str(caught.value)) < 250
 
 
 def test_it_is_bounded_and_the_oldest_are_dropped():
-    queue = PoseQueue()
-    for number in range(WAITING_POSES + 10):
+    queue = pose_queue.PoseQueue()
+    for number in range(pose_queue.WAITING_POSES + 10):
         queue.put(TimedPose(PadPose(0, 0), number))
-    assert [one.time_ns for one in queue.take()] == list(range(10, WAITING_POSES + 10))
+    assert [one.time_ns for one in queue.take()] == list(range(10, pose_queue.WAITING_POSES + 10))
     assert queue.dropped == 10 and queue.take() == []
 
 
@@ -84,8 +80,8 @@ def pose(time_ns, x_mm=0.0, sensor=None, holds=False):
 @pytest.fixture
 def step():
     """Function that puts poses, takes them at a time, and looks then."""
-    queue = PoseQueue()
-    intake = PoseIntake(make_runtime(), queue)
+    queue = pose_queue.PoseQueue()
+    intake = pose_queue.PoseIntake(make_runtime(), queue)
 
     def step(now_ns, *poses):
         for one in poses:
@@ -100,7 +96,9 @@ def test_a_pose_out_of_order_is_refused_with_one_line_for_many(step):
     taken, ((kind, _, text),), refused = step(100, *map(pose, (50, 40, 30, 60)))
     assert taken == [50, 60] and kind == "poses_trouble" and "40 ns, is not after" in text and refused == 2
     assert step(200, pose(1)) == ([], [], 3)
-    assert "poses_trouble" in [kind for kind, *_ in step(100 + REPEATED_NS, pose(2))[1]], "after a while again"
+    assert "poses_trouble" in [kind for kind, *_ in step(100 + pose_queue.REPEATED_NS, pose(2))[1]], (
+        "after a while again"
+    )
 
 
 def test_poses_of_a_clock_that_is_ahead_are_used_and_noted(step):

@@ -69,17 +69,16 @@ def without_checkout():
     return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
 
+def ended(folder, *command, **environment):
+    """Run a command in a folder to its end, whatever that is."""
+    settings = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "timeout": 240}
+    return subprocess.run(list(map(str, command)), cwd=folder, env=without_checkout() | environment, **settings)
+
+
 def run(command, **environment):
-    variables = without_checkout() | environment
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240, env=variables)
+    done = ended(None, *command, **environment)
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-def ended(folder, *command):
-    """Run a command in a folder to its end, whatever that is."""
-    settings = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "timeout": 60}
-    return subprocess.run(list(map(str, command)), cwd=folder, env=without_checkout(), **settings)
 
 
 def test_it_holds_the_runtime_alone_with_types_for_a_checker(fresh, demo, tmp_path):
