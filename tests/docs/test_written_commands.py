@@ -97,7 +97,7 @@ LEFT_OUT = {
     r"python examples/lerobot_camera_tactile_sr/observe\.py .*": "needs LeRobot; test_lerobot runs it",
     r"python examples/train_and_deploy\.py .*": "trains for minutes; test_examples runs it, shortened",
     r"python docs/live_pictures\.py": "pictures a browser for half a minute, which is looked at",
-    r"mkdocs build .*": "test_site builds the site",
+    r"mkdocs build .*": "test_architecture builds the site",
     r"python tests/docs/field_tables\.py": "writes the pages themselves; test_written_figures compares them",
 }
 

@@ -206,7 +206,7 @@ def test_a_hang_up_and_a_cable_out_keep_all_records(emulator, files, tmp_path, h
     assert (f"\nedge-sr: {emulator.port}: link lost" in errors) != hang_up
 
 
-def test_signals_the_parent_ignores_end_nothing_a_closed_pipe_does(emulator, files):
+def test_ignored_signals_end_nothing_and_a_closed_pipe_does(emulator, files):
     """As under nohup, or in the background of a shell without jobs."""
     numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGUSR1)
     before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
@@ -225,7 +225,7 @@ def test_signals_the_parent_ignores_end_nothing_a_closed_pipe_does(emulator, fil
     assert "\nEMULATED " in errors and "Traceback" not in errors and "Exception" not in errors
 
 
-def test_without_a_model_the_link_stays_closed_or_is_closed_again(emulator, tmp_path):
+def test_without_a_model_the_link_is_closed_or_stays_so(emulator, tmp_path):
     """A link that is slow to open would hold up the message of a missing one; and it opens while another one loads."""
     (tmp_path / "broken.onnx").write_text("no model")
     done = run("--model", tmp_path / "broken.onnx", "--source", f"slcan:{emulator.port}")

@@ -137,7 +137,7 @@ def model(tmp_path_factory):
     return write_model(tmp_path_factory.mktemp("model") / "pad46.onnx", CONTRACT_46)
 
 
-def test_bytes_become_patterns_of_the_pads_own_shape_and_files_of_it(model, tmp_path):
+def test_bytes_become_patterns_and_files_of_the_pads_own_shape(model, tmp_path):
     """Scans at rest, then a press on one taxel of the third row, over a pseudo-terminal, and played again."""
     counts = REST_46 + np.random.default_rng(0).integers(-2, 3, (SCANS, *REST_46.shape)).astype(np.int32)
     for taxel, size in ((PRESSED, 4000), (PRESSED - 1, 400), (PRESSED - 6, 400)):  # a taxel alone would be a fault
