@@ -62,25 +62,22 @@ def _unknown(value: Any) -> str:
     return "" if value is None else f"{value:g}".replace("nan", "NaN")
 
 
-TABLES = {("formats.md", "record"): record_table, ("middleware.md", "shm"): memory_table}
+TABLES = {"formats.md": ("record", record_table), "middleware.md": ("shm", memory_table)}
 
 
 def with_tables(page: str) -> str:
-    """Return the text of a page with its tables of fields as they should be."""
-    text = (DOCS / page).read_text()
-    for (name, table), rows in TABLES.items():
-        if name == page:
-            before, begin, after = text.partition(f"<!-- fields: {table} -->\n\n")
-            _, end, after = after.partition("<!-- end of fields -->")
-            if not end:
-                raise ValueError(f"{page} has no place for the fields of {table}: expected {begin!r} and an end")
-            text = before + begin + "\n".join(rows()) + "\n\n" + end + after
-    return text
+    """Return the text of a page with its table of fields as it should be."""
+    table, rows = TABLES[page]
+    before, begin, after = (DOCS / page).read_text().partition(f"<!-- fields: {table} -->\n\n")
+    _, end, after = after.partition("<!-- end of fields -->")
+    if not end:
+        raise ValueError(f"{page} has no place for the fields of {table}: expected {begin!r} and an end")
+    return before + begin + "\n".join(rows()) + "\n\n" + end + after
 
 
 def main() -> None:
     """Write the pages."""
-    for page in dict.fromkeys(page for page, _ in TABLES):
+    for page in TABLES:
         (DOCS / page).write_text(with_tables(page))
         sys.stdout.write(f"{DOCS / page}\n")
 

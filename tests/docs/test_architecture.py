@@ -1,4 +1,7 @@
-"""The page of the architecture is true of imports, files, names and values; files are short."""
+"""The page of the architecture is true of imports, files, names and values; files are short.
+
+The documentation builds strictly as a site, so all links lead somewhere, and fetches nothing from elsewhere.
+"""
 
 import ast
 import re
@@ -6,10 +9,13 @@ import subprocess
 from collections import Counter
 from functools import cache
 from pathlib import Path
+from urllib.parse import urldefrag
 
 import grimp
 import pytest
 from edge_samples import ROOT
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
 
 PACKAGES = ("export", "train", "edge", "firmware_bridge")
 WITH_ROOMS = ("edge", "firmware_bridge")
@@ -114,3 +120,36 @@ def test_a_class_has_a_name_of_its_own(package):
     found = (node for path in (ROOT / package).rglob("*.py") for node in ast.parse(path.read_text()).body)
     names = Counter(one.name for one in found if isinstance(one, ast.ClassDef) and not one.name.startswith("_"))
     assert [name for name, count in names.items() if count > 1] == []
+
+
+FETCHING = re.compile(r"<(?:img|script|link|iframe|source|video|object)\b[^>]*>")
+ELSEWHERE = re.compile(r"\b(?:src|href|data)=[\"']?(?:\w+:)?//|(?:url\(|@import)\s*[\"']?(?:https?:)?//")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    build(load_config(str(ROOT / "mkdocs.yml"), site_dir=str(folder), strict=True))
+    return folder
+
+
+def test_the_first_page_and_the_reports_are_there(site):
+    for page in ("index.html", "trouble.html", "reports/families.html", "decisions.html"):
+        assert (site / page).is_file(), page
+    assert not list(site.rglob("*.py"))
+    assert "<code>echo 1 | sudo tee /sys/" in (site / "trouble.html").read_text()
+
+
+def test_nothing_is_fetched_from_elsewhere(site):
+    for path in (*site.rglob("*.html"), *site.rglob("*.css")):
+        text = path.read_text(encoding="utf-8")
+        parts = FETCHING.findall(text) if path.suffix == ".html" else [text]
+        assert [one for one in parts if ELSEWHERE.search(one) and "canonical" not in one] == [], path.name
+
+
+def test_what_links_of_the_repository_lead_to_is_there():
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        for address in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            address, _ = urldefrag(address)
+            if address and not re.match(r"\w+:", address):
+                assert (page.parent / address).exists(), f"{page.name} leads to {address}"

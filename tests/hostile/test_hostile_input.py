@@ -1,6 +1,5 @@
 """Files and models made to harm: each is refused in one line, before it costs time or memory."""
 
-import io
 import pickle
 import zipfile
 from pathlib import Path
@@ -73,14 +72,6 @@ def test_no_reader_of_arrays_runs_what_is_pickled(tmp_path, name, read, error, h
     assert one_line(raised) and not harm.exists()
 
 
-def zipped(kind: int = zipfile.ZIP_STORED, **members: bytes) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", kind) as whole:
-        for name, content in members.items():
-            whole.writestr(name, content)
-    return file.getvalue()
-
-
 def with_member(name: str, old: bytes, new: bytes) -> bytes:
     """Return a recording of which one member has other bytes, which numpy does not write."""
     spoilt = npy(recording_arrays()[name]).replace(old, new, 1)
@@ -103,8 +94,8 @@ BOMB = archive(compressed=True, **recording_arrays() | {"counts": np.zeros((300_
         (with_member("sensor", b"4\0\0\0", b"\0\0\x11\0"), "not Unicode"),
         (with_member("sensor", b"4\0\0\0", b"\0\xd8\0\0"), "not Unicode"),
         (with_member("sensor", b"'shape': (2,)", b"'shape': ((((("), "not a whole"),
-        (zipped(**{f"{number:060000d}": b"" for number in range(20)}), r"a piece of 1,\d+,\d+ bytes, expected at most"),
-        (zipped(zipfile.ZIP_BZIP2, **{"counts.npy": npy(np.zeros(3))}), "compressed in another way"),
+        (stored({f"{number:060000d}": b"" for number in range(20)}), r"a piece of 1,\d+,\d+ bytes, expected at most"),
+        (stored({"counts": npy(np.zeros(3))}, zipfile.ZIP_BZIP2), "compressed in another way"),
     ],
     ids=range(8),
 )
@@ -126,18 +117,14 @@ def test_of_an_archive_what_is_asked_for_alone_is_read(tmp_path):
         read_npz(path, ["other"], 1000)
 
 
-def test_a_csv_line_without_end(tmp_path, bounded_memory):
+def test_a_csv_line_without_end_and_a_file_larger_than_is_read(tmp_path, bounded_memory, limits):
     path = tmp_path / "finger.csv"
     with path.open("wb") as file:
         file.write((",".join(csv_header()) + "\n").encode())
         file.truncate(1 << 32)
     with pytest.raises(RecordingError, match="line 2: a line longer than 16384 bytes"):
         load_recording(path)
-
-
-def test_a_csv_file_larger_than_is_read(tmp_path, limits):
     limits(csv_reader, MOST_CSV_BYTES=1000)
-    path = tmp_path / "finger.csv"
     path.write_text(",".join(csv_header()) + "\n" + (",".join(["1"] * 48) + "\n") * 10)
     with pytest.raises(RecordingError, match=r"larger than 1,000 bytes, expected a smaller one"):
         load_recording(path)
@@ -170,78 +157,79 @@ REFUSED = [
     (b"\xba\x00" + SEVEN[1:], "side file"),
     *((broken + SEVEN[1:], "damaged") for broken in (b"\xba\x80\x80\x80\x80\x00", b"\xba\x80\x80\x80\x10")),
     *((broken, "damaged") for broken in (b"\x3b", b"\x02\x00")),
+    (b"\x08\x01" * 1001, "more than 1000 fields"),
 ]
 
 
-class TestModels:
-    def outside(self, tmp_path, location: str, where: str) -> Path:
-        """A model whose weights lie elsewhere, in an initializer or in a node's attribute."""
-        tensor = TensorProto(name="w", data_type=1, dims=[4], data_location=TensorProto.EXTERNAL)
-        tensor.external_data.add(key="location", value=location)
-        take = [helper.make_node("Constant", [], ["w"], value=tensor)] if where == "attribute" else []
-        nodes = [*take, helper.make_node("Add", ["x", "w"], ["y"])]
-        ends = [helper.make_tensor_value_info(name, 1, [4]) for name in "xy"]
-        graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [] if take else [tensor])
-        path = tmp_path / "models" / "m.onnx"
-        path.parent.mkdir()
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
-        path.write_bytes(model.SerializeToString())
-        return path
+def outside(tmp_path, location: str, where: str) -> Path:
+    """A model whose weights lie elsewhere, in an initializer or in a node's attribute."""
+    tensor = TensorProto(name="w", data_type=1, dims=[4], data_location=TensorProto.EXTERNAL)
+    tensor.external_data.add(key="location", value=location)
+    take = [helper.make_node("Constant", [], ["w"], value=tensor)] if where == "attribute" else []
+    nodes = [*take, helper.make_node("Add", ["x", "w"], ["y"])]
+    ends = [helper.make_tensor_value_info(name, 1, [4]) for name in "xy"]
+    graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [] if take else [tensor])
+    path = tmp_path / "models" / "m.onnx"
+    path.parent.mkdir()
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
+    path.write_bytes(model.SerializeToString())
+    return path
 
-    @pytest.mark.parametrize("where", ["initializer", "attribute"])
-    @pytest.mark.parametrize("location", ["../../etc/passwd", "{}/secret", "link", "beside", ""])
-    def test_weights_in_another_file_never_reach_onnxruntime(self, tmp_path, monkeypatch, location, where):
-        (tmp_path / "secret").write_bytes(bytes(16))
-        path = self.outside(tmp_path, location.format(tmp_path), where)
-        (path.parent / "link").symlink_to(tmp_path / "secret")
-        (path.parent / "beside").write_bytes(bytes(16))
-        monkeypatch.setattr("onnxruntime.InferenceSession", lambda *_, **__: pytest.fail("it was asked"))
-        with pytest.raises(ModelError, match=r"m.onnx: keeps its weights in a side file, expected one file") as raised:
-            ModelSession(path)
+
+@pytest.mark.parametrize("where", ["initializer", "attribute"])
+@pytest.mark.parametrize("location", ["../../etc/passwd", "{}/secret", "link", "beside", ""])
+def test_weights_in_another_file_never_reach_onnxruntime(tmp_path, monkeypatch, location, where):
+    (tmp_path / "secret").write_bytes(bytes(16))
+    path = outside(tmp_path, location.format(tmp_path), where)
+    (path.parent / "link").symlink_to(tmp_path / "secret")
+    (path.parent / "beside").write_bytes(bytes(16))
+    monkeypatch.setattr("onnxruntime.InferenceSession", lambda *_, **__: pytest.fail("it was asked"))
+    with pytest.raises(ModelError, match=r"m.onnx: keeps its weights in a side file, expected one file") as raised:
+        ModelSession(path)
+    assert one_line(raised)
+
+
+@pytest.mark.parametrize(("model", "words"), REFUSED)
+def test_what_is_no_plain_graph_is_refused(model, words, limits):
+    limits(onnx_guard, MOST_FIELDS=1000)
+    with pytest.raises(ModelError, match=words):
+        check_plain(model)
+
+
+def test_names_that_are_not_text_are_one_line_and_no_stdout(tmp_path, capfd):
+    path = write_model(tmp_path / "tiny.onnx")
+    for name in (b"Squeeze", b"tactile.sensor", b"window"):
+        content = path.read_bytes()
+        (tmp_path / "odd.onnx").write_bytes(content.replace(name, b"\xe5" * len(name)))
+        with pytest.raises(ModelError) as raised:
+            ModelSession(tmp_path / "odd.onnx")
         assert one_line(raised)
+    assert capfd.readouterr().out == ""
 
-    @pytest.mark.parametrize(("model", "words"), REFUSED)
-    def test_what_is_no_plain_graph_is_refused(self, model, words):
-        with pytest.raises(ModelError, match=words):
-            check_plain(model)
 
-    def test_more_fields_than_a_graph_has(self, limits):
-        limits(onnx_guard, MOST_FIELDS=1000)
-        with pytest.raises(ModelError, match="more than 1000 fields"):
-            check_plain(b"\x08\x01" * 1001)
+def test_weights_that_are_larger_than_their_file(tmp_path):
+    path = write_model(tmp_path / "huge.onnx")
+    model = onnx.load(path)
+    model.graph.initializer[0].dims[0] = 1 << 40
+    onnx.save(model, path)
+    with pytest.raises(ModelError, match=r"huge\.onnx: not a model that onnxruntime can load: .*weights") as raised:
+        ModelSession(path)
+    assert one_line(raised)
 
-    def test_names_that_are_not_text_are_one_line_and_no_stdout(self, tmp_path, capfd):
-        path = write_model(tmp_path / "tiny.onnx")
-        for name in (b"Squeeze", b"tactile.sensor", b"window"):
-            content = path.read_bytes()
-            (tmp_path / "odd.onnx").write_bytes(content.replace(name, b"\xe5" * len(name)))
-            with pytest.raises(ModelError) as raised:
-                ModelSession(tmp_path / "odd.onnx")
-            assert one_line(raised)
-        assert capfd.readouterr().out == ""
 
-    def test_weights_that_are_larger_than_their_file(self, tmp_path):
-        path = write_model(tmp_path / "huge.onnx")
-        model = onnx.load(path)
-        model.graph.initializer[0].dims[0] = 1 << 40
-        onnx.save(model, path)
-        with pytest.raises(ModelError, match=r"huge\.onnx: not a model that onnxruntime can load: .*weights") as raised:
-            ModelSession(path)
-        assert one_line(raised)
-
-    def test_an_array_that_no_machine_holds(self, tmp_path):
-        contract = make_contract(taps=1)
-        nodes = [
-            helper.make_node("ConstantOfShape", ["shape"], ["huge"]),
-            helper.make_node("ReduceSum", ["huge"], ["sum"], keepdims=0),
-            helper.make_node("ReduceMax", ["window"], ["newest"], axes=[2, 3]),
-            helper.make_node("ReduceMax", ["newest"], ["most"], axes=[1], keepdims=0),  # of each window
-            helper.make_node("Add", ["most", "sum"], ["more"]),
-            helper.make_node("Add", ["blank", "more"], ["pattern"]),
-        ]
-        blank = np.zeros((1, *contract.pattern_shape), np.float32)
-        constants = {"shape": np.array([1 << 30, 1 << 20]), "blank": blank}
-        path = save_graph(tmp_path / "huge.onnx", nodes, contract, constants, contract.to_metadata())
-        with pytest.raises(ModelError, match=r"huge\.onnx: .*allocate") as raised:
-            ModelSession(path)
-        assert one_line(raised)
+def test_an_array_that_no_machine_holds(tmp_path):
+    contract = make_contract(taps=1)
+    nodes = [
+        helper.make_node("ConstantOfShape", ["shape"], ["huge"]),
+        helper.make_node("ReduceSum", ["huge"], ["sum"], keepdims=0),
+        helper.make_node("ReduceMax", ["window"], ["newest"], axes=[2, 3]),
+        helper.make_node("ReduceMax", ["newest"], ["most"], axes=[1], keepdims=0),  # of each window
+        helper.make_node("Add", ["most", "sum"], ["more"]),
+        helper.make_node("Add", ["blank", "more"], ["pattern"]),
+    ]
+    blank = np.zeros((1, *contract.pattern_shape), np.float32)
+    constants = {"shape": np.array([1 << 30, 1 << 20]), "blank": blank}
+    path = save_graph(tmp_path / "huge.onnx", nodes, contract, constants, contract.to_metadata())
+    with pytest.raises(ModelError, match=r"huge\.onnx: .*allocate") as raised:
+        ModelSession(path)
+    assert one_line(raised)

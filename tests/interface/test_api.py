@@ -57,31 +57,14 @@ def played(files, **settings):
     return records(out.read_text())
 
 
-@pytest.mark.parametrize(
-    ("options", "settings"),
-    [
-        ("", {}),
-        (
-            "--every-scan --contact-on-counts 2000 --contact-off-counts 900 --counts-per-newton 1200 "
-            "--idle-reset-s 0.1",
-            {"every_scan": True, "contact_on_counts": 2000, "contact_off_counts": 900, "counts_per_newton": 1200}
-            | {"idle_reset_s": 0.1},
-        ),
-    ],
-)
-def test_records_of_the_command_line_are_those_of_the_api(files, options, settings):
+def test_records_of_the_command_line_are_those_of_the_api(files):
     fixed = ["replay", files / "taps.npz", "--model", files / "sure.onnx", "--baseline", files / "zero.json"]
-    made = played(files, **settings)
-    said = records(run(*fixed, "--sink", "jsonl:-", *options.split()).stdout)
-    assert len(said) == 40 and {one["state"] for one in said} == {"idle", "contact"}
-    assert [timeless(one) for one in made] == [timeless(one) for one in said]
-
-
-def test_a_source_is_used_open():
-    source = open_source("demo")
-    for use in (lambda: open_runtime(FakeModel(), source), lambda: next(iter(stream(source)))):
-        with pytest.raises(UsageError, match=r"^source demo is not open: use it in a with statement"):
-            use()
+    thresholds = {"contact_on_counts": 2000, "contact_off_counts": 900, "counts_per_newton": 1200, "idle_reset_s": 0.1}
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in thresholds.items()]
+    for typed, settings in (([], {}), (["--every-scan", *options], thresholds | {"every_scan": True})):
+        made, said = played(files, **settings), records(run(*fixed, "--sink", "jsonl:-", *typed).stdout)
+        assert len(said) == 40 and {one["state"] for one in said} == {"idle", "contact"}
+        assert [timeless(one) for one in made] == [timeless(one) for one in said]
 
 
 def stream(source, model=None, **settings):
@@ -91,6 +74,8 @@ def stream(source, model=None, **settings):
 @pytest.mark.parametrize(
     ("ask", "words"),
     [
+        (lambda _: open_runtime(FakeModel(), open_source("demo")), "^source demo is not open: use it in a with"),
+        (lambda _: next(iter(stream(open_source("demo")))), "^source demo is not open: use it in a with statement"),
         (lambda _: open_source("demo", give_up_s=NAN), "give_up_s is nan, expected 0 or more"),
         (lambda _: open_source(["demo"]), r"source is \['demo'\], expected text"),
         (lambda _: api.examine("demo", rate_hz=-1), "rate_hz is -1, expected a positive number"),
@@ -114,6 +99,13 @@ def stream(source, model=None, **settings):
         (lambda source: Stream(source, None), "runtime is None, expected what open_runtime returned"),
         (lambda _: Stream(None, None), "source is None, expected an open one"),
         (lambda _: api.Commands().put("zero"), r'command is \'zero\', expected a Command, such as Command\("zero"\)'),
+        *(
+            (
+                lambda _, wrong=wrong: api.Command(*wrong),
+                r"^Command\(name=.*, expected 'reset' or 'zero', a sensor's name",
+            )
+            for wrong in (("Reset",), ("zero", 4), ("zero", "4", 1), ("zero", ""))
+        ),
         (lambda _: api.Commands().poses.put(PadPose(0, 0)), "pose is PadPose.*, expected a TimedPose"),
         (lambda source: open_runtime(FakeModel(), source).pose((1, 2, 3), 0), r"pose is \(1, 2, 3\), expected a PadP"),
         (lambda _: api.ObjectMap(centre_mm=(NAN, 0)), r"centre of a map is \(nan, 0\), expected two finite numbers"),
@@ -226,9 +218,8 @@ def test_poses_of_another_thread_are_those_of_the_next_scans():
             thread.join()
             steps[result.scan.number].set()
     assert [result.pose and result.pose.x_mm for result in results] == [None, *range(1, len(PRESSES))]
-    assert results[-1].pose == PadPose(6, 0, 5, 0.5)
-    last = results[-1]
-    turn = np.radians(5)
+    last, turn = results[-1], np.radians(5)
+    assert last.pose == PadPose(6, 0, 5, 0.5)
     assert last.taps_used == 2 and last.poses[1, :2] == pytest.approx([(1 - 6) * np.cos(turn), 5 * np.sin(turn)])
     window = model.contract.scale_window(last.window)
     np.testing.assert_allclose(last.pattern, posed_pattern(window, last.poses), atol=1e-4)

@@ -1,10 +1,14 @@
-"""`edge-sr` as a user runs it: help, recordings, models, baselines, refusals; signals, and streams closed or full."""
+"""`edge-sr` as a user runs it: help, recordings, models, baselines, refusals; signals, and streams closed or full.
+
+At the end: recordings whose pad is held or only recovers, where they are zeroed, and the remedy that is printed.
+"""
 
 import json
 import os
 import pty
 import re
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -15,9 +19,9 @@ import numpy as np
 import pytest
 from bridge_samples import write_recording as write_counts
 from cli_samples import EDGE_SR, TIMEOUT_S, assert_refused, base_options, files, records, run, start, write_recording
-from edge_samples import BASELINE, ROOT, make_contract, wait_for, write_model
+from edge_samples import BASELINE, REST, ROOT, make_contract, wait_for, write_model
 
-from edge import __version__
+from edge.api import open_recording, take_baselines
 from edge.cli import listings
 from edge.cli import main as cli
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -37,25 +41,21 @@ def test_a_sensor_gets_one_taps_model_and_the_demo_that_of_poses(tmp_path):
         assert {record["model"] for record in records(done.stdout)} == {model}
 
 
-class TestHelp:
-    def test_the_short_help_has_the_usual_options_on_one_screen(self, capsys):
-        assert cli.main(["-h"]) == 0
-        lines = capsys.readouterr().out.splitlines()
-        assert len(lines) < 60 and any("--source" in line for line in lines)
-        assert lines[-1].startswith("edge-sr --help lists all options")
+def test_the_short_help_has_the_usual_options_on_one_screen(capsys):
+    assert cli.main(["-h"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 60 and any("--source" in line for line in lines)
+    assert lines[-1].startswith("edge-sr --help lists all options")
 
-    def test_help_fits_the_terminal_and_80_columns(self, capsys, monkeypatch):
-        for columns, most in (("1", 40), ("40", 40), ("80", 80), ("200", 80)):
-            monkeypatch.setenv("COLUMNS", columns)
-            for command in (None, *cli.COMMANDS):
-                with pytest.raises(SystemExit, match="0"):
-                    cli.main([*([command] if command else []), "--help"])
-                out, errors = capsys.readouterr()
-                assert errors == "" and max(map(len, out.splitlines())) <= most, command
 
-    def test_the_version(self):
-        done = run("doctor", "--version")
-        assert (done.returncode, done.stdout, done.stderr) == (0, f"edge-sr {__version__}\n", "")
+def test_help_fits_the_terminal_and_80_columns(capsys, monkeypatch):
+    for columns, most in (("1", 40), ("40", 40), ("80", 80), ("200", 80)):
+        monkeypatch.setenv("COLUMNS", columns)
+        for command in ("", *cli.COMMANDS):
+            with pytest.raises(SystemExit, match="0"):
+                cli.main([*command.split(), "--help"])
+            out, errors = capsys.readouterr()
+            assert errors == "" and max(map(len, out.splitlines())) <= most, command
 
 
 @pytest.mark.parametrize("options", [[], ["--measure"]])
@@ -91,8 +91,9 @@ def there(tmp_path):
 
 
 KNOWN = "--model {files}/tiny.onnx --baseline {files}/zero.json"
-REST = "--source replay:{files}/rest.npz"
+AT_REST = "--source replay:{files}/rest.npz"
 MAP = "map --source replay:none.npz --out"
+NONE = "replay none.npz --model none"
 ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
 
 
@@ -113,28 +114,17 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (3, f"{KNOWN} --source slcan:serial=NOSUCH", ["NOSUCH"]),
         (2, f"{ZERO}{{files}}/rest.npz --out {{tmp}}/other.onnx", ["other.onnx holds something else: give another"]),
         (3, f"{ZERO}{{tmp}}/moving.npz", ["nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by"]),
-        (4, f"{REST} --model {{tmp}}/other.onnx", ["'pitch_mm' is 5.0", "4.7"]),
+        (4, f"{AT_REST} --model {{tmp}}/other.onnx", ["'pitch_mm' is 5.0", "4.7"]),
+        (2, f"{NONE} --sink jsonl:- --fields force_n,patern", ["no field 'patern'", "did you mean pattern?"]),
+        (2, f"{NONE} --fields force_n", ["--fields requires a sink of JSON records"]),
+        (2, f"{NONE} --sink jsonl:a --sink mcap:a.mcap --sink jsonl:./a", ["'jsonl:a' and 'jsonl:./a' write to the"]),
+        (2, f"{NONE} --sink zenoh:a//b", ["'a//b'", "words with '/' between"]),
     ],
 )
 def test_a_refusal_is_one_line_with_its_code_and_all_files_stay(code, typed, words, files, there):
-    """Those that tests/golden has are not repeated."""
     before = {path.name: path.read_bytes() for path in there.iterdir()}
     assert_refused(run(*typed.format(files=files, tmp=there).split(" ")), code, *words)
     assert {path.name: path.read_bytes() for path in there.iterdir()} == before
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        (["--sink", "jsonl:-", "--fields", "force_n,patern"], ["no field 'patern'", "did you mean pattern?"]),
-        (["--fields", "force_n"], ["--fields requires a sink of JSON records"]),
-        (["--sink", "jsonl:-", "--sink", "jsonl:-"], ["sinks 'jsonl:-' and 'jsonl:-' write to the same place"]),
-        (["--sink", "jsonl:a", "--sink", "mcap:a.mcap", "--sink", "jsonl:./a"], ["'jsonl:a' and 'jsonl:./a'"]),
-        (["--sink", "zenoh:a//b"], ["'a//b'", "words with '/' between"]),
-    ],
-)
-def test_impossible_fields_and_sinks_are_2_before_anything_opens(wrong, words):
-    assert_refused(run("replay", "none.npz", "--model", "none", *wrong), 2, *words)
 
 
 def test_several_adapters_without_source_are_3_and_not_emulated(plugged, capsys):
@@ -159,21 +149,16 @@ def test_a_full_disk_is_5_after_the_summary(files):
         assert "cannot write records to stdout: No space left" in process.communicate()[1] and process.returncode == 5
 
 
-def test_of_a_recording_a_few_free_scans_are_enough(tmp_path):
+def test_of_a_recording_a_few_free_scans_are_enough(files, tmp_path):
     begins_in_contact = write_recording(tmp_path / "held.npz", [3000] * 50 + [0] * 40)
     done = run("baseline", "--source", f"replay:{begins_in_contact}", "--out", tmp_path / "free.json")
     assert done.returncode == 0 and "sensor 4: zeroed from its scans 5" in done.stderr
     assert done.stderr.count("where the pad is still and pressed least\n") == 1
     assert np.abs(load_baselines(tmp_path / "free.json")["4"].counts - BASELINE.counts).max() < 5
-
-
-@pytest.mark.parametrize("paced", [[], ["--paced"]])
-def test_a_baseline_of_a_recording_without_a_date_has_no_age(files, tmp_path, paced):
-    """It begins in contact, so that its baseline is taken beforehand."""
-    path = write_recording(tmp_path / "held.npz", [3000] * 50 + [0] * 40)
-    done = run("replay", path, *paced, "--model", files / "tiny.onnx", "--sink", "jsonl:-")
-    got = [one for one in records(done.stdout) if one["state"] != "event"]
-    assert {(one["baseline_origin"], one["baseline_age_s"]) for one in got} == {("recording", None)}
+    for paced in ([], ["--paced"]):  # a baseline of a recording without a date has no age
+        done = run("replay", begins_in_contact, *paced, "--model", files / "tiny.onnx", "--sink", "jsonl:-")
+        got = [one for one in records(done.stdout) if one["state"] != "event"]
+        assert {(one["baseline_origin"], one["baseline_age_s"]) for one in got} == {("recording", None)}
 
 
 def test_the_baseline_of_a_pad_that_may_be_held_is_in_doubt(tmp_path):
@@ -190,95 +175,78 @@ def test_the_example_is_a_grip_of_two_emulated_fingers():
         assert len(held) > 300 and sum(one["trusted"] is True for one in held) > 0.9 * len(held)
 
 
-class TestEnds:
-    @pytest.fixture
-    def emulator(self, files):
-        with Emulator([load_recording(files / "taps.npz")], loop=True) as emulator:
-            yield emulator
+@pytest.fixture
+def emulator(files):
+    with Emulator([load_recording(files / "taps.npz")], loop=True) as emulator:
+        yield emulator
 
-    def follow(self, emulator, files, *more):
-        """Return a run on the emulator and its first records."""
-        process = start(*base_options(files), "--source", f"slcan:{emulator.port}", "--sink", "jsonl:-", *more)
-        first = [process.stdout.readline() for _ in range(10)]
-        return process, first
 
-    def rest(self, process):
-        """Return the unread rest; not by communicate(), which ignores the text that readline() has read ahead."""
-        rest, errors = process.stdout.read(), process.stderr.read()  # of errors there are too few to fill a pipe
-        process.wait(TIMEOUT_S)
-        return rest, errors
+def follow(emulator, files, *more):
+    """Return a run on the emulator and its first records."""
+    process = start(*base_options(files), "--source", f"slcan:{emulator.port}", "--sink", "jsonl:-", *more)
+    return process, [process.stdout.readline() for _ in range(10)]
 
-    def test_a_hang_up_ends_it_cleanly_with_the_summary(self, emulator, files, tmp_path):
-        """As Ctrl-C and SIGTERM do, which tests of keys and of poses send."""
-        process, first = self.follow(emulator, files, "--sink", f"mcap:{tmp_path}/out.mcap")
+
+@pytest.mark.parametrize(("hang_up", "code"), [(True, 0), (False, 3)])
+def test_a_hang_up_and_a_cable_out_keep_all_records(emulator, files, tmp_path, hang_up, code):
+    """A hang-up as Ctrl-C and SIGTERM do, which tests of keys and of poses send."""
+    process, first = follow(emulator, files, "--sink", f"mcap:{tmp_path}/out.mcap", "--give-up-s", "0")
+    if hang_up:
         process.send_signal(signal.SIGHUP)
-        rest, errors = self.rest(process)
-        assert process.returncode == 0
-        got = records("".join(first) + rest)
-        assert [record["scan"] for record in got] == list(range(len(got)))
-        assert {record["source"] for record in got} == {"emulated"}
-        assert f"\nEMULATED slcan:{emulator.port}: {len(got)} scans" in errors and "Traceback" not in errors
-        assert len(load_recording(tmp_path / "out.mcap").tracks[0].counts) == len(got)
-
-    def test_a_signal_that_the_parent_wants_ignored_is_ignored(self, emulator, files):
-        """As under nohup, or in the background of a shell without jobs."""
-        numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGUSR1)
-        before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
-        try:
-            process, _ = self.follow(emulator, files)
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-        for number in numbers:
-            process.send_signal(number)
-        got = records("".join(process.stdout.readline() for _ in range(100)))
-        assert len(got) == 100 and not [one for one in got if one["state"] == "event"]
-        process.send_signal(signal.SIGTERM)
-        self.rest(process)
-        assert process.returncode == 0
-
-    def test_a_closed_pipe_ends_it_cleanly_with_the_summary(self, emulator, files):
-        process, _ = self.follow(emulator, files)
-        process.stdout.close()
-        assert process.wait(TIMEOUT_S) == 0
-        errors = process.stderr.read()
-        assert "\nEMULATED " in errors and "Traceback" not in errors and "Exception" not in errors
-
-    def test_the_cable_out_keeps_the_records_and_is_3(self, emulator, files, tmp_path):
-        process, first = self.follow(emulator, files, "--sink", f"mcap:{tmp_path}/out.mcap", "--give-up-s", "0")
+    else:
         emulator.hang_up()
-        rest, errors = self.rest(process)
-        assert process.returncode == 3
-        got = records("".join(first) + rest)
-        assert len(load_recording(tmp_path / "out.mcap").tracks[0].counts) == len(got) >= 10
-        _, *summary, last = errors.splitlines()
-        assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
-        assert last.startswith(f"edge-sr: {emulator.port}: link lost")
+    # Not by communicate(), which ignores the text that readline() has read ahead.
+    rest, errors = process.stdout.read(), process.stderr.read()
+    assert process.wait(TIMEOUT_S) == code and "Traceback" not in errors
+    got = records("".join(first) + rest)
+    assert [record["scan"] for record in got] == list(range(len(got)))
+    assert {record["source"] for record in got} == {"emulated"}
+    assert len(load_recording(tmp_path / "out.mcap").tracks[0].counts) == len(got) >= 10
+    assert f"\nEMULATED slcan:{emulator.port}: {len(got)} scans" in errors
+    assert (f"\nedge-sr: {emulator.port}: link lost" in errors) != hang_up
 
-    def test_a_missing_model_ends_before_the_link_is_opened(self, emulator, capsys):
-        """A link that is slow to open would hold up the message."""
-        received = []
-        emulator.adapter.feed = lambda data: received.append(data) or b""
-        assert cli.main(["--model", "nothere", "--source", f"slcan:{emulator.port}"]) == 4
-        assert capsys.readouterr().err.startswith("edge-sr: no model 'nothere'") and received == []
 
-    def test_a_model_that_cannot_be_used_leaves_the_channel_closed(self, emulator, tmp_path):
-        """The link opens while the model loads."""
-        (tmp_path / "broken.onnx").write_text("no model")
-        done = run("--model", tmp_path / "broken.onnx", "--source", f"slcan:{emulator.port}")
-        assert done.returncode == 4 and "broken.onnx: not a model" in done.stderr
-        wait_for(lambda: not emulator.adapter.channel_open)
+def test_ignored_signals_end_nothing_and_a_closed_pipe_does(emulator, files):
+    """As under nohup, or in the background of a shell without jobs."""
+    numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGUSR1)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+    try:
+        process, _ = follow(emulator, files)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for number in numbers:
+        process.send_signal(number)
+    got = records("".join(process.stdout.readline() for _ in range(100)))
+    assert len(got) == 100 and not [one for one in got if one["state"] == "event"]
+    process.stdout.close()
+    assert process.wait(TIMEOUT_S) == 0
+    errors = process.stderr.read()
+    assert "\nEMULATED " in errors and "Traceback" not in errors and "Exception" not in errors
 
-    def test_a_port_that_never_speaks_is_3_with_what_to_do(self, files):
-        leader, follower = pty.openpty()
-        name = f"slcan:{os.ttyname(follower)}"
-        done = run(*base_options(files), "--source", name, "--duration-s", "6")
-        os.close(leader), os.close(follower)
-        assert done.returncode == 3 and done.stdout == ""
-        doctor = f"edge-sr doctor --source {name} shows what is wrong"
-        lines = done.stderr.splitlines()
-        assert re.match(rf"edge-sr: no scan in [56] s: nothing came: is the sensor powered .*{doctor}$", lines[1])
-        assert lines[-1].startswith(f"edge-sr: no scan came from {name}: ") and lines[-1].endswith(doctor)
+
+def test_without_a_model_the_link_is_closed_or_stays_so(emulator, tmp_path):
+    """A link that is slow to open would hold up the message of a missing one; and it opens while another one loads."""
+    (tmp_path / "broken.onnx").write_text("no model")
+    done = run("--model", tmp_path / "broken.onnx", "--source", f"slcan:{emulator.port}")
+    assert done.returncode == 4 and "broken.onnx: not a model" in done.stderr
+    wait_for(lambda: not emulator.adapter.channel_open)
+    received = []
+    emulator.adapter.feed = lambda data: received.append(data) or b""
+    done = run("--model", "nothere", "--source", f"slcan:{emulator.port}")
+    assert done.returncode == 4 and done.stderr.startswith("edge-sr: no model 'nothere'") and received == []
+
+
+def test_a_port_that_never_speaks_is_3_with_what_to_do(files):
+    leader, follower = pty.openpty()
+    name = f"slcan:{os.ttyname(follower)}"
+    done = run(*base_options(files), "--source", name, "--duration-s", "6")
+    os.close(leader), os.close(follower)
+    assert done.returncode == 3 and done.stdout == ""
+    doctor = f"edge-sr doctor --source {name} shows what is wrong"
+    lines = done.stderr.splitlines()
+    assert re.match(rf"edge-sr: no scan in [56] s: nothing came: is the sensor powered .*{doctor}$", lines[1])
+    assert lines[-1].startswith(f"edge-sr: no scan came from {name}: ") and lines[-1].endswith(doctor)
 
 
 def in_shell(redirection, *arguments, unbuffered=""):
@@ -317,9 +285,8 @@ def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
     (tmp_path / "numpy.py").write_text("print('importing', flush=True)\nimport time\ntime.sleep(60)\n")
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"}
     command = [sys.executable, "-m", "edge", "demo"]
-    process = subprocess.Popen(
-        command, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment, text=True, **pipes)
     assert process.stdout.readline() == "importing\n"
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=TIMEOUT_S)
@@ -352,3 +319,73 @@ def test_fewer_descriptors_than_a_run_needs_end_in_one_line():
     errors = process.communicate(timeout=TIMEOUT_S)[1]
     assert process.returncode == 5 and "Traceback" not in errors
     assert errors.splitlines()[-1] == "edge-sr: Too many open files: allow more of them, ulimit -n 256"
+
+
+GRIP = np.zeros((3, 4, 4))
+GRIP[2] = np.linspace(400, 1100, 16).reshape(4, 4)
+DRIFT = np.zeros((3, 4, 4))
+DRIFT[2] = 560 + 90 * np.cos(np.arange(16)).reshape(4, 4)
+DRIFT[0] = -110
+
+
+def write_parts(path, *parts):
+    """Write a recording of (scans, counts over rest) parts, as the vendor's logger does, without times."""
+    felt = np.array([felt + np.zeros((3, 4, 4)) for scans, felt in parts for _ in range(scans)])
+    noise = np.random.default_rng(0).normal(0, 2, felt.shape)
+    return write_counts(path, np.rint(REST + felt + noise).astype(int))
+
+
+def moving(scans):
+    """Parts of a grip that moves all the time, as real ones do."""
+    return [(1, GRIP * (1 + 0.04 * np.sin(number / 3))) for number in range(scans)]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_model(tmp_path / "tiny.onnx")
+    (tmp_path / "monday").mkdir()
+    (tmp_path / "tuesday").mkdir()
+    return tmp_path
+
+
+def played(folder, *arguments):
+    done = run("replay", *arguments, "--model", folder / "tiny.onnx", "--sink", "jsonl:-")
+    assert done.returncode == 0, done.stderr
+    return [one for one in records(done.stdout) if one["state"] != "event"], done.stderr
+
+
+def test_the_printed_remedy_for_a_recording_of_a_held_pad_works(folder):
+    held = write_parts(folder / "monday" / "left.csv", *moving(150))
+    released = write_parts(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
+    shown, stderr = played(folder, held, "--rate-hz", "60")
+    assert not any(one["contact"] or one["trusted"] for one in shown) and {one["state"] for one in shown} != {"idle"}
+    first, second = re.findall(r"edge-sr ((?:baseline|replay) .*?)(?:;| shows)", stderr)
+    zero = str(folder / "zero.json")
+    done = run(*shlex.split(first.replace("OTHER", str(released)).replace("zero.json", zero)))
+    assert done.returncode == 0, done.stderr
+    shown, _ = played(folder, *shlex.split(second.replace("zero.json", zero))[1:])
+    assert {one["state"] for one in shown} == {"baseline_in_doubt"} and not any(one["trusted"] for one in shown)
+    assert all(one["pattern"] is not None for one in shown)
+    shown, _ = played(folder, released, "--rate-hz", "60")
+    assert {one["state"] for one in shown[:89]} == {"contact"} and {one["state"] for one in shown[95:]} == {"idle"}
+
+
+def test_a_recordings_baseline_has_no_age_and_the_former_stays(folder):
+    path, zero = write_parts(folder / "left.csv", (120, 0)), folder / "zero.json"
+    zero.write_text('{"format": "tactile-baseline"}')
+    done = run("baseline", "--source", f"replay:{path}", "--rate-hz", "600", "--out", zero)
+    assert done.returncode == 0 and f"the former file is now {zero}.bak" in done.stdout, done.stderr
+    assert (folder / "zero.json.bak").read_text() == '{"format": "tactile-baseline"}'
+    assert json.loads(zero.read_text())["baselines"][0]["created_unix_s"] is None
+    assert np.isnan(load_baselines(zero)["left"].created_unix_s)
+    with open_recording(path, rate_hz=60) as source:
+        assert np.isnan(take_baselines(source)["left"].created_unix_s)
+
+
+def test_a_pad_that_only_recovers_gives_patterns(folder):
+    falls = [(1, GRIP * share) for share in (0.8, 0.5, 0.2)]
+    recovers = [(1, np.array([0, 0, 30.0 * (1 - n / 35)])[:, None, None]) for n in range(36)]
+    path = write_parts(folder / "left.csv", *moving(20), *falls, *recovers)
+    shown, stderr = played(folder, path, "--rate-hz", "60")
+    assert {one["state"] for one in shown[:21]} == {"contact"} and {one["state"] for one in shown[26:]} == {"idle"}
+    assert re.search(r"pressed least; it recovers there: a taxel may be off by \d+ counts", stderr)

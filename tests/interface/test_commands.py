@@ -1,23 +1,36 @@
-"""Commands on stdin, by signals, and as keys on a real terminal: every way out leaves the terminal as it was."""
+"""Commands on stdin, by signals, and as keys on a real terminal: every way out leaves the terminal as it was.
+
+And bars on a real pseudo-terminal, none anywhere else; commands of advice.
+"""
 
 import contextlib
+import fcntl
+import io
 import json
 import os
 import pty
+import re
 import select
 import shlex
 import signal
+import struct
+import subprocess
 import sys
 import termios
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bridge_samples import make_counts
+from bridge_samples import write_recording as write_counts
 from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, wait_for, write_model
 
+from edge.cli import main as cli
 from edge.pipeline.commands import RESET, Command, Commands, command_lines, read_stdin, user_commands
+from edge.terminal.progress_bar import progress
 from firmware_bridge.zeroing.baseline import save_baselines
 
 OPEN = contextlib.ExitStack()
@@ -34,12 +47,6 @@ def taken(commands, count):
     got = []
     wait_for(lambda: got.extend(commands.poll()) or len(got) + commands.refused >= count)
     return got
-
-
-def polled_stdin():
-    commands = Commands()
-    with read_stdin(commands):
-        return commands.poll()
 
 
 @pytest.fixture
@@ -103,41 +110,38 @@ def test_poses_and_commands_part_and_bad_lines_stop_nothing(pipe):
 
 def test_a_terminal_and_a_missing_stdin_are_left_alone(stdin):
     leader, follower = os.openpty()
+    os.write(leader, b'{"cmd": "reset"}\n')
     with os.fdopen(follower) as terminal:
-        stdin(terminal)
-        os.write(leader, b'{"cmd": "reset"}\n')
-        assert polled_stdin() == []
-    assert polled_stdin() == []  # closed
-    stdin(None)
-    assert polled_stdin() == []
+        for given in (terminal, None):
+            stdin(given)
+            commands = Commands()
+            with read_stdin(commands):
+                assert commands.poll() == []
+    stdin(terminal)  # closed
+    with read_stdin(commands):
+        assert commands.poll() == []
     os.close(leader)
-
-
-class Told:
-    def __init__(self):
-        self.done = []
-
-    def reset(self):
-        self.done.append("reset")
-
-    def zero(self, name=None, *, force=False):
-        self.done.append((name, force))
 
 
 def test_all_places_are_asked_and_obeyed_in_their_order(stdin, pipe):
     with os.fdopen(os.dup(pipe[0])) as commands:
         stdin(commands)
-        runtime = Told()
+        done = []
+
+        def zero(name=None, *, force=False):
+            done.append((name, force))
+
+        runtime = SimpleNamespace(reset=lambda: done.append("reset"), zero=zero)
         with user_commands() as everything:
             os.write(pipe[1], b'nonsense\n{"cmd": "reset"}\n{"cmd": "zero", "sensor": "4", "force": true}\n')
             os.kill(os.getpid(), signal.SIGUSR1)
             deadline_s = time.monotonic() + 20
-            while len(runtime.done) < 3 and time.monotonic() < deadline_s:  # a thread reads stdin
+            while len(done) < 3 and time.monotonic() < deadline_s:  # a thread reads stdin
                 for command in everything.poll():
                     command.carry_out(runtime)
             assert everything.refused == 1
-    runtime.done.remove((None, False))  # the signal's, which may come between those of stdin
-    assert runtime.done == ["reset", ("4", True)]
+    done.remove((None, False))  # the signal's, which may come between those of stdin
+    assert done == ["reset", ("4", True)]
 
 
 TIMEOUT_S = 60.0
@@ -171,17 +175,6 @@ class Terminal:
         self.type(shlex.join(command) + "\n")
         self.until(lambda: not self.line_mode() and self.records.exists() and self.records.stat().st_size > 0)
 
-    def wait_for(self, *texts):
-        """Read until one of the texts is shown; it, and what was before, is taken."""
-        end_s = time.monotonic() + TIMEOUT_S
-        while not any(text.encode() in self.shown for text in texts):
-            if not select.select([self.leader], [], [], max(end_s - time.monotonic(), 0))[0]:
-                raise AssertionError(f"waited for {texts}, saw {self.shown[-600:]!r}")
-            self.shown += os.read(self.leader, 65536)
-        cut = min(self.shown.index(t.encode()) + len(t) for t in texts if t.encode() in self.shown)
-        taken, self.shown = self.shown[:cut], self.shown[cut:]
-        return taken.decode(errors="replace")
-
     def type(self, text):
         os.write(self.leader, text.encode())
 
@@ -198,9 +191,8 @@ class Terminal:
                 self.shown += os.read(self.leader, 65536)
 
     def events(self):
-        lines = self.records.read_text().splitlines() if self.records.exists() else []
-        found = [json.loads(line)["event"] for line in lines if line.endswith("}")]
-        return [event for event in found if event]
+        lines = self.records.read_text().splitlines()
+        return [event for line in lines if line.endswith("}") and (event := json.loads(line)["event"])]
 
     def close(self):
         with contextlib.suppress(OSError):
@@ -225,7 +217,7 @@ def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     terminal.until(lambda: any("zeroed on demand" in event for event in terminal.events()))
 
     terminal.type("\x1a")  # Ctrl-Z
-    terminal.wait_for("Stopped")
+    terminal.until(lambda: b"Stopped" in terminal.shown)
     assert terminal.line_mode()
     terminal.type("fg\n")
     terminal.until(lambda: not terminal.line_mode())
@@ -234,7 +226,7 @@ def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     terminal.until(lambda: len(terminal.events()) > before)
 
     terminal.type("\x1a")
-    terminal.wait_for("Stopped")
+    terminal.until(lambda: terminal.shown.count(b"Stopped") == 2)
     size = terminal.records.stat().st_size
     terminal.type("bg\n")
     terminal.until(lambda: terminal.records.stat().st_size > size + 50_000)
@@ -244,4 +236,101 @@ def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     terminal.type("\x03")  # Ctrl-C
     terminal.until(terminal.line_mode)
     terminal.type("echo ended by $?.\n")
-    assert "scans, " in terminal.wait_for("ended by 0.")
+    terminal.until(lambda: b"ended by 0." in terminal.shown)
+    assert b"scans, " in terminal.shown
+
+
+@pytest.fixture
+def window():
+    """Both ends of a pseudo-terminal of 80 columns; ours is never waited for."""
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    os.set_blocking(ours, False)
+
+    def said():
+        said = b""
+        with contextlib.suppress(OSError):
+            while True:
+                said += os.read(ours, 1 << 16)
+        return said.decode()
+
+    stream = os.fdopen(theirs, "w")
+    made = SimpleNamespace(ours=ours, stream=stream, said=said)
+    yield made
+    with contextlib.suppress(OSError):  # what is left for a window that was closed
+        stream.close()
+    if made.ours is not None:
+        os.close(ours)
+
+
+@pytest.mark.parametrize("options", [[], ["--sink", "status"], ["--paced"]])
+@pytest.mark.parametrize("to", ["-", "out.jsonl"])
+def test_a_replay_shows_the_live_line(tmp_path, monkeypatch, capfd, window, options, to):
+    monkeypatch.chdir(tmp_path)
+    write_model(tmp_path / "tiny.onnx")
+    path = write_counts(tmp_path / "finger.csv", make_counts(7), rate_hz=1000)
+    with contextlib.redirect_stderr(window.stream):
+        assert cli.main(["replay", str(path), "--model", "tiny.onnx", "--sink", f"jsonl:{to}", *options]) == 0
+    written = capfd.readouterr().out if to == "-" else (tmp_path / to).read_text()
+    assert written.count("\n") == 7
+    lives = "--sink" in options or to != "-"  # else records may go to the same terminal
+    assert ("REPLAY | " in window.said()) == lives
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Clock of the bars, which goes on as a test sets `now_s`."""
+    clock = SimpleNamespace(now_s=100.0)
+    monkeypatch.setattr("tqdm.std.time", lambda: clock.now_s)
+    return clock
+
+
+def test_a_bar_comes_after_two_seconds_and_leaves_no_trace(window, clock):
+    with progress("poses", 400, "pose", done=100, stream=window.stream) as bar:
+        clock.now_s += 1.9
+        bar.update(38)
+        assert window.said() == ""
+        clock.now_s += 0.1
+        bar.update(2)
+        shown = window.said()
+        assert re.search(r"^\r?poses:  35%\|.+20\.0pose/s", shown) and "\n" not in shown, shown
+        os.close(window.ours)  # a window that is closed ends no work
+        window.ours = None
+        bar.update()
+
+
+def test_nothing_without_a_terminal_or_beyond_torchruns_first(window, monkeypatch, clock):
+    pipe = io.StringIO()
+    for stream, rank in ((pipe, "0"), (window.stream, "1")):
+        monkeypatch.setenv("RANK", rank)
+        with progress("poses", 400, "pose", stream=stream) as bar:
+            clock.now_s += 9
+            bar.update()
+    assert pipe.getvalue() == window.said() == ""
+
+
+ODD = ["a  b", "it's;$c`d", "tab\there\nthere", "back\\slash\x1b", "\x9b\u202eé\udcff"]
+
+
+@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize(
+    ("command", "advice", "meant"),
+    [
+        (["record", "NAME.npz"], "cannot be recorded: ", ["NAME.mcap", "NAME.mcap", "NAME.npz"]),
+        (["--sink", "npz:NAME.npz"], ", then ", ["NAME.mcap", "NAME.npz"]),
+        (["--source", "NAME.csv"], "did you mean ", ["replay:NAME.csv"]),
+    ],
+)
+def test_commands_of_advice_can_be_typed_whatever_the_file(name, command, advice, meant, capsys):
+    """As bash takes it: its arguments that hold the name are those of the files."""
+    assert cli.main([word.replace("NAME", name) for word in command]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.isprintable()
+    typed = line.partition(advice)[2].removesuffix("?")
+    if not typed.startswith("edge-sr"):
+        typed = f"edge-sr {typed}"
+    script = 'edge-sr() { printf "%s\\0" "$@"; }; afterwards() { "$@"; }; ' + typed
+    bash = ["bash", "-c", script.encode(errors="surrogateescape")]
+    done = subprocess.run(bash, capture_output=True, check=True, env=os.environ | {"LC_ALL": "C.UTF-8"})
+    words = done.stdout.decode(errors="surrogateescape").split("\0")
+    assert [one for one in words if "." in one] == [one.replace("NAME", name) for one in meant]

@@ -4,7 +4,7 @@ import json
 import os
 import re
 import subprocess
-from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from link_rigs import make_network
@@ -23,12 +23,6 @@ from firmware_bridge.scans.slcan_scans import SlcanScans
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus", "USB-CAN Plus", "VScom")
 GRIPPER = Port("/dev/ttyUSB1", (0x0403, 0x6015), "GRIP1", "FT231X USB UART", "FT231X USB UART", "FTDI")
 BUILT_IN = Port("/dev/ttyS0", None, None, "n/a")
-
-
-def write(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-    return path
 
 
 def test_ports_that_share_a_serial_number_are_named_by_path():
@@ -57,7 +51,10 @@ def ip(tmp_path, monkeypatch):
 
     def write_program(**said):
         cases = "".join(f"'-json -details link show {name}') echo '{text}';; " for name, text in said.items())
-        write(tmp_path / "bin/ip", f'#!/bin/sh\ncase "$*" in {cases} *) exit 1;; esac').chmod(0o755)
+        program = tmp_path / "bin" / "ip"
+        program.parent.mkdir()
+        program.write_text(f'#!/bin/sh\ncase "$*" in {cases} *) exit 1;; esac')
+        program.chmod(0o755)
         monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
 
     return write_program
@@ -81,15 +78,14 @@ def test_can_interfaces(tmp_path, ip):
     assert slcan0.problems == ("is down: sudo ip link set slcan0 up",) and "slcand" in slcan0.looks_like
 
 
-@pytest.mark.parametrize(
-    "said", [bitrate(1_000_000), '[{"linkinfo": {"info_kind": "vcan"}}]', "[]", "Option is unknown"]
-)
-def test_a_bitrate_that_is_right_or_not_known_is_no_problem(tmp_path, ip, said, monkeypatch):
-    make_network(tmp_path, "can0", up=True)
-    ip(can0=said)
-    assert can_interfaces(tmp_path)[0].problems == ()
+def test_a_bitrate_that_is_right_or_not_known_is_no_problem(tmp_path, ip, monkeypatch):
+    said = (bitrate(1_000_000), '[{"linkinfo": {"info_kind": "vcan"}}]', "[]", "Option is unknown")
+    for number in range(len(said)):
+        make_network(tmp_path, f"can{number}", up=True)
+    ip(**{f"can{number}": text for number, text in enumerate(said)})
+    assert [one.problems for one in can_interfaces(tmp_path)] == [()] * 4
     monkeypatch.setenv("PATH", "")
-    assert can_interfaces(tmp_path)[0].problems == ()
+    assert [one.problems for one in can_interfaces(tmp_path)] == [()] * 4
 
 
 @pytest.fixture
@@ -102,15 +98,12 @@ def gs_usb(plugged, monkeypatch):
     return there
 
 
-def test_nothing_is_said_in_one_line(plugged, gs_usb, capsys):
+def test_everything_is_listed_adapters_first(plugged, gs_usb, capsys):
     plugged[:] = [BUILT_IN]
     assert cli.main(["devices"]) == 3
     out, err = capsys.readouterr()
     assert err == f"edge-sr: {NOTHING}\n" and "both plugs" in NOTHING and "dmesg" in NOTHING and "dialout" in NOTHING
     assert out.splitlines()[0] == "/dev/ttyS0" and out.splitlines()[-1] == SERVER_HINT
-
-
-def test_everything_is_listed_adapters_first(plugged, gs_usb, capsys):
     plugged[:] = [BUILT_IN, GRIPPER, VSCOM._replace(path="/dev/ttyUSB9")]
     gs_usb[:] = [
         GsUsbDevice(1, 4, (0x1D50, 0x606F), "004B", "candleLight"),
@@ -122,13 +115,9 @@ def test_everything_is_listed_adapters_first(plugged, gs_usb, capsys):
     out, err = capsys.readouterr()
     blocks = [line for line in out.splitlines() if not line.startswith(" ")]
     assert blocks == [
-        "/dev/ttyUSB9  0403:6015  serial D30BL366",
-        "bus 1 device 4  1d50:606f  serial 004B",
-        "bus 1 device 5  1d50:606f",
-        "bus 2 device 4 at 2-1.4  1d50:606f  serial 0001",
-        "bus 2 device 5 at 2-3  1d50:606f  serial 0001",
-        "/dev/ttyS0",
-        "/dev/ttyUSB1  0403:6015  serial GRIP1",
+        *("/dev/ttyUSB9  0403:6015  serial D30BL366", "bus 1 device 4  1d50:606f  serial 004B"),
+        *("bus 1 device 5  1d50:606f", "bus 2 device 4 at 2-1.4  1d50:606f  serial 0001"),
+        *("bus 2 device 5 at 2-3  1d50:606f  serial 0001", "/dev/ttyS0", "/dev/ttyUSB1  0403:6015  serial GRIP1"),
         SERVER_HINT,
     ]
     assert "  looks like VScom USB-CAN Plus\n  --source slcan:serial=D30BL366\n" in out
@@ -140,11 +129,7 @@ def test_everything_is_listed_adapters_first(plugged, gs_usb, capsys):
 
 
 def test_usb_that_cannot_be_read_hides_no_port(plugged, gs_usb, capsys, monkeypatch):
-    why = "libusb cannot be loaded: pip install libusb-package"
-
-    def fail():
-        raise DeviceError(why)
-
+    fail = Mock(side_effect=DeviceError(why := "libusb cannot be loaded: pip install libusb-package"))
     monkeypatch.setattr(gs_usb_link, "gs_usb_devices", fail)
     plugged[:] = [VSCOM]
     assert cli.main(["devices"]) == 0

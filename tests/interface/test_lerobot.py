@@ -19,7 +19,6 @@ from edge_samples import ROOT, make_contract, make_wrench_result
 
 from edge.api import demo_recording, load_model
 
-README = ROOT / "README.md"
 PACKAGE = ROOT / "examples/lerobot_camera_tactile_sr"
 REAL = importlib.util.find_spec("lerobot") is not None
 
@@ -111,13 +110,16 @@ def test_what_is_no_sensor_is_refused_unless_one_pretends(plugin):
     with pytest.raises(ConnectionError, match=r"is emulated, not a sensor: set pretend"):
         camera.connect()
     assert not camera.is_connected
-    lost = camera_of(plugin, source="slcan:/dev/nothing")
     with pytest.raises(ConnectionError, match=r"/dev/nothing"):
-        lost.connect()
-    with pytest.raises(ValueError, match=r"image of 41x40, expected a multiple of the pattern's 40x40"):
-        camera_of(plugin, width=41)
-    with pytest.raises(ValueError, match=r"window_scans is 0, expected 1 or more"):
-        camera_of(plugin, window_scans=0)
+        camera_of(plugin, source="slcan:/dev/nothing").connect()
+    for wrong, told in (
+        ({"width": 41}, "image of 41x40, expected a multiple of the pattern's 40x40"),
+        ({"window_scans": 0}, "window_scans is 0, expected 1 or more"),
+        ({"render": "heatmap"}, "'heatmap', expected one of pattern, vector_rgb"),
+        ({"force_max_n": 0}, "0"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            camera_of(plugin, **wrong)
 
 
 def test_images_have_a_fixed_range_and_mark_what_is_not_believed(plugin):
@@ -133,7 +135,8 @@ def test_images_have_a_fixed_range_and_mark_what_is_not_believed(plugin):
     for doubt in ({"trusted": False}, {"trusted": None}, {"state": "baseline_in_doubt", "contact": None}):
         assert rendering.image_of(replace(one, **doubt), contract)[..., 2].max() == 0
     assert rendering.image_of(replace(free, pattern=None), contract)[..., 2].min() == 255, "nothing touches"
-    unknown = replace(one, pattern=None, deviation=None, contact=None, zeroed=None, wrench=None, state="zeroing")
+    nothing = dict.fromkeys(("pattern", "deviation", "contact", "zeroed", "wrench"))
+    unknown = replace(one, **nothing, state="zeroing")
     assert not rendering.image_of(unknown, contract).any()
     state = observation.state_of(replace(pressed, trusted=True), contract)
     assert [state[name] for name in observation.WRENCH] == [*pressed.wrench.force_n, *pressed.wrench.torque_n_mm]
@@ -157,12 +160,6 @@ def test_forces_are_drawn_as_the_paxini_plugin_draws_them(plugin):
     assert (np.delete(image, slice(50, 60), axis=1) == 128).all()
     for doubt in ({"trusted": False}, {"state": "baseline_in_doubt", "contact": None}, {"traction": None}):
         assert (drawn.image_of(replace(one, **doubt), contract) == 128).all()
-    for wrong, told in (
-        ({"render": "heatmap"}, "'heatmap', expected one of pattern, vector_rgb"),
-        ({"force_max_n": 0}, "0"),
-    ):
-        with pytest.raises(ValueError, match=told):
-            camera_of(plugin, **wrong)
 
 
 def test_a_recording_becomes_frames_at_the_dataset_s_rate(plugin):
@@ -205,7 +202,9 @@ def test_lerobot_loads_the_dataset_that_it_was_given(plugin, tmp_path):
 
 
 def test_the_example_observes_by_the_command_of_the_readme(plugin, argv, capsys):
-    (line,) = re.findall(r"^ *(python examples/lerobot_camera_tactile_sr/observe\.py .*)$", README.read_text(), re.M)
+    (line,) = re.findall(
+        r"^ *(python examples/lerobot_camera_tactile_sr/observe\.py .*)$", (ROOT / "README.md").read_text(), re.M
+    )
     words = shlex.split(line, comments=True)[1:]
     argv(words)
     runpy.run_path(str(ROOT / words[0]), run_name="__main__")

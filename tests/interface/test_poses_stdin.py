@@ -12,16 +12,8 @@ from pose_samples import make_posed_contract
 
 from edge.api import PadPose, Runtime, Source, TimedPose, pump
 from edge.mapping.sink import check_npz
+from edge.pipeline import pose_queue
 from edge.pipeline.commands import Commands
-from edge.pipeline.pose_queue import (
-    FURTHEST_AHEAD_NS,
-    REPEATED_NS,
-    WAITING_POSES,
-    PoseError,
-    PoseIntake,
-    PoseQueue,
-    pose_of_fields,
-)
 from edge.pipeline.run_statistics import Statistics
 from firmware_bridge.schedule import SENSOR_SILENT_NS
 
@@ -33,45 +25,48 @@ WHOLE = (
 NOW_NS = 10**12
 
 
-class TestFields:
-    def test_all_fields_are_taken_and_place_alone_is_enough(self):
-        expected = TimedPose(PadPose(1.5, 0.0, 5.0, 0.2, 1.0), 123, "4", True)
-        assert pose_of_fields(json.loads(WHOLE), NOW_NS) == expected
-        assert pose_of_fields({"cmd": "pose", "x_mm": 1, "y_mm": -2.0}, NOW_NS) == TimedPose(PadPose(1, -2), NOW_NS)
-        assert pose_of_fields({"x_mm": 0, "y_mm": 0, "time_ns": NOW_NS + FURTHEST_AHEAD_NS}, NOW_NS)  # a little ahead
-
-    @pytest.mark.parametrize(
-        ("fields", "words"),
-        [
-            ({"y_mm": 0}, "x_mm is missing"),
-            ({"x_mm": 0, "y_mm": "1"}, "y_mm is '1'"),
-            ({"x_mm": 0, "y_mm": True}, "y_mm is True"),
-            ({"x_mm": float("nan"), "y_mm": 0}, "x_mm is nan"),
-            ({"x_mm": 10**400, "y_mm": 0}, "x_mm is 1000"),
-            ({"x_mm": 0, "y_mm": 0, "error_mm": -1}, "error_mm is -1"),
-            ({"x_mm": 0, "y_mm": 0, "turn": 3}, "it has 'turn'"),
-            ({"x_mm": 0, "y_mm": 0, "sensor": 4}, "sensor is 4"),
-            ({"x_mm": 0, "y_mm": 0, "sensor": "\x1b[2J"}, "sensor is"),
-            ({"x_mm": 0, "y_mm": 0, "holds": 1}, "holds is 1"),
-            ({"x_mm": 0, "y_mm": 0, "time_ns": 1.5}, "time_ns is 1.5"),
-            ({"x_mm": 0, "y_mm": 0, "time_ns": -1}, "time_ns is -1"),
-            ({"x_mm": 0, "y_mm": 0, "time_ns": 1_700_000_000 * 10**9}, "s ahead of now"),
-            ({"cmd": "zero", "x_mm": 0, "y_mm": 0}, "cmd is 'zero'"),
-        ],
+def test_all_fields_are_taken_and_place_alone_is_enough():
+    expected = TimedPose(PadPose(1.5, 0.0, 5.0, 0.2, 1.0), 123, "4", True)
+    assert pose_queue.pose_of_fields(json.loads(WHOLE), NOW_NS) == expected
+    assert pose_queue.pose_of_fields({"cmd": "pose", "x_mm": 1, "y_mm": -2.0}, NOW_NS) == TimedPose(
+        PadPose(1, -2), NOW_NS
     )
-    def test_a_field_that_is_wrong_is_named(self, fields, words):
-        with pytest.raises(PoseError, match=words.replace("[", r"\[")) as caught:
-            pose_of_fields(fields, NOW_NS)
-        assert str(caught.value).isprintable() and len(str(caught.value)) < 250
+    assert pose_queue.pose_of_fields(
+        {"x_mm": 0, "y_mm": 0, "time_ns": NOW_NS + pose_queue.FURTHEST_AHEAD_NS}, NOW_NS
+    )  # a little ahead
 
 
-class TestQueue:
-    def test_it_is_bounded_and_the_oldest_are_dropped(self):
-        queue = PoseQueue()
-        for number in range(WAITING_POSES + 10):
-            queue.put(TimedPose(PadPose(0, 0), number))
-        assert [one.time_ns for one in queue.take()] == list(range(10, WAITING_POSES + 10))
-        assert queue.dropped == 10 and queue.take() == []
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"y_mm": 0}, "x_mm is missing"),
+        ({"x_mm": 0, "y_mm": "1"}, "y_mm is '1'"),
+        ({"x_mm": 0, "y_mm": True}, "y_mm is True"),
+        ({"x_mm": float("nan"), "y_mm": 0}, "x_mm is nan"),
+        ({"x_mm": 10**400, "y_mm": 0}, "x_mm is 1000"),
+        ({"x_mm": 0, "y_mm": 0, "error_mm": -1}, "error_mm is -1"),
+        ({"x_mm": 0, "y_mm": 0, "turn": 3}, "it has 'turn'"),
+        ({"x_mm": 0, "y_mm": 0, "sensor": 4}, "sensor is 4"),
+        ({"x_mm": 0, "y_mm": 0, "sensor": "\x1b[2J"}, "sensor is"),
+        ({"x_mm": 0, "y_mm": 0, "holds": 1}, "holds is 1"),
+        ({"x_mm": 0, "y_mm": 0, "time_ns": 1.5}, "time_ns is 1.5"),
+        ({"x_mm": 0, "y_mm": 0, "time_ns": -1}, "time_ns is -1"),
+        ({"x_mm": 0, "y_mm": 0, "time_ns": 1_700_000_000 * 10**9}, "s ahead of now"),
+        ({"cmd": "zero", "x_mm": 0, "y_mm": 0}, "cmd is 'zero'"),
+    ],
+)
+def test_a_field_that_is_wrong_is_named(fields, words):
+    with pytest.raises(pose_queue.PoseError, match=words.replace("[", r"\[")) as caught:
+        pose_queue.pose_of_fields(fields, NOW_NS)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 250
+
+
+def test_it_is_bounded_and_the_oldest_are_dropped():
+    queue = pose_queue.PoseQueue()
+    for number in range(pose_queue.WAITING_POSES + 10):
+        queue.put(TimedPose(PadPose(0, 0), number))
+    assert [one.time_ns for one in queue.take()] == list(range(10, pose_queue.WAITING_POSES + 10))
+    assert queue.dropped == 10 and queue.take() == []
 
 
 def make_runtime():
@@ -82,44 +77,47 @@ def pose(time_ns, x_mm=0.0, sensor=None, holds=False):
     return TimedPose(PadPose(x_mm, 0.0), time_ns, sensor, holds)
 
 
-class TestIntake:
-    """Each step puts poses, takes them at a time, and looks then."""
+@pytest.fixture
+def step():
+    """Function that puts poses, takes them at a time, and looks then."""
+    queue = pose_queue.PoseQueue()
+    intake = pose_queue.PoseIntake(make_runtime(), queue)
 
-    @pytest.fixture
-    def step(self):
-        queue = PoseQueue()
-        intake = PoseIntake(make_runtime(), queue)
+    def step(now_ns, *poses):
+        for one in poses:
+            queue.put(one)
+        taken = [one.time_ns for one in intake.take([], None, now_ns)]
+        return taken, [(event.kind, event.sensor, event.text) for event in intake.look(now_ns)], queue.refused
 
-        def step(now_ns, *poses):
-            for one in poses:
-                queue.put(one)
-            taken = [one.time_ns for one in intake.take([], None, now_ns)]
-            return taken, [(event.kind, event.sensor, event.text) for event in intake.look(now_ns)], queue.refused
+    return step
 
-        return step
 
-    def test_a_pose_out_of_order_is_refused_with_one_line_for_many(self, step):
-        taken, ((kind, _, text),), refused = step(100, *map(pose, (50, 40, 30, 60)))
-        assert taken == [50, 60] and kind == "poses_trouble" and "40 ns, is not after" in text and refused == 2
-        assert step(200, pose(1)) == ([], [], 3)
-        assert "poses_trouble" in [kind for kind, *_ in step(100 + REPEATED_NS, pose(2))[1]], "after a while again"
+def test_a_pose_out_of_order_is_refused_with_one_line_for_many(step):
+    taken, ((kind, _, text),), refused = step(100, *map(pose, (50, 40, 30, 60)))
+    assert taken == [50, 60] and kind == "poses_trouble" and "40 ns, is not after" in text and refused == 2
+    assert step(200, pose(1)) == ([], [], 3)
+    assert "poses_trouble" in [kind for kind, *_ in step(100 + pose_queue.REPEATED_NS, pose(2))[1]], (
+        "after a while again"
+    )
 
-    def test_poses_of_a_clock_that_is_ahead_are_used_and_noted(self, step):
-        """Each scan has the pose of a scan that came so much earlier."""
-        assert step(NOW_NS, pose(NOW_NS + 50_000_000)) == ([NOW_NS + 50_000_000], [], 0)
-        taken, ((kind, _, text),), refused = step(NOW_NS + 1, pose(NOW_NS + 900_000_001))
-        assert (taken, kind, refused) == ([NOW_NS + 900_000_001], "poses_trouble", 0)
-        assert text.startswith("poses come 0.90 s before the time that they state") and "CLOCK_MONOTONIC" in text
 
-    def test_a_silent_source_is_reported_once_and_when_it_is_back(self, step):
-        assert step(10**12)[1] == [], "without any pose there is nothing to miss"
-        step(0, pose(1), pose(2, sensor="4"), pose(1, sensor="6", holds=True))
-        assert step(SENSOR_SILENT_NS, pose(3, sensor="4"))[1] == []
-        ((kind, sensor, text),) = step(SENSOR_SILENT_NS + 1)[1]
-        assert (kind, sensor) == ("poses_silent", None) and "one tap" in text
-        assert step(SENSOR_SILENT_NS + 2)[1] == []
-        assert step(SENSOR_SILENT_NS + 10**8, pose(4))[1] == [("poses_back", None, "poses are back after 0.6 s")]
-        assert {sensor for _, sensor, _ in step(10**15)[1]} == {None, "4"}, "one that holds is not missed"
+def test_poses_of_a_clock_that_is_ahead_are_used_and_noted(step):
+    """Each scan has the pose of a scan that came so much earlier."""
+    assert step(NOW_NS, pose(NOW_NS + 50_000_000)) == ([NOW_NS + 50_000_000], [], 0)
+    taken, ((kind, _, text),), refused = step(NOW_NS + 1, pose(NOW_NS + 900_000_001))
+    assert (taken, kind, refused) == ([NOW_NS + 900_000_001], "poses_trouble", 0)
+    assert text.startswith("poses come 0.90 s before the time that they state") and "CLOCK_MONOTONIC" in text
+
+
+def test_a_silent_source_is_reported_once_and_when_it_is_back(step):
+    assert step(10**12)[1] == [], "without any pose there is nothing to miss"
+    step(0, pose(1), pose(2, sensor="4"), pose(1, sensor="6", holds=True))
+    assert step(SENSOR_SILENT_NS, pose(3, sensor="4"))[1] == []
+    ((kind, sensor, text),) = step(SENSOR_SILENT_NS + 1)[1]
+    assert (kind, sensor) == ("poses_silent", None) and "one tap" in text
+    assert step(SENSOR_SILENT_NS + 2)[1] == []
+    assert step(SENSOR_SILENT_NS + 10**8, pose(4))[1] == [("poses_back", None, "poses are back after 0.6 s")]
+    assert {sensor for _, sensor, _ in step(10**15)[1]} == {None, "4"}, "one that holds is not missed"
 
 
 class PoseSink(ListSink):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bridge_samples import REAL_RECORDINGS
-from chaos_judge import HELD_CYCLES, RATE_HZ
+from chaos import HELD_CYCLES, RATE_HZ
 from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
 from runtime_samples import PRESS, Pushed, make_runtime
 

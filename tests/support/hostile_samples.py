@@ -37,9 +37,9 @@ def npy(value: object) -> bytes:
     return file.getvalue()
 
 
-def stored(members: dict[str, bytes]) -> bytes:
+def stored(members: dict[str, bytes], kind: int = zipfile.ZIP_STORED) -> bytes:
     file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as whole:
+    with zipfile.ZipFile(file, "w", kind) as whole:
         for name, content in members.items():
             whole.writestr(f"{name}.npy", content)
     return file.getvalue()

@@ -13,23 +13,13 @@ from types import ModuleType
 from typing import Any, ClassVar
 
 
-class DeviceNotConnectedError(ConnectionError):
-    """A call that needs an open device."""
-
-
-class DeviceAlreadyConnectedError(ConnectionError):
-    """A second connect."""
-
-
 @dataclass(kw_only=True)
 class CameraConfig:
-    """Settings of a camera, known by the word that it was registered with."""
-
     fps: int | None = None
     width: int | None = None
     height: int | None = None
 
-    words: ClassVar[dict[type, str]] = {}
+    words: ClassVar[dict[type, str]] = {}  # by which classes were registered
 
     @classmethod
     def register_subclass(cls, word: str):
@@ -45,8 +35,6 @@ class CameraConfig:
 
 
 class Camera(abc.ABC):
-    """Interface of every camera."""
-
     def __init__(self, config: CameraConfig) -> None:
         self.fps, self.width, self.height = config.fps, config.width, config.height
 
@@ -96,10 +84,9 @@ def install(monkeypatch) -> None:
         "lerobot.cameras.configs": {"CameraConfig": CameraConfig},
         "lerobot.cameras.utils": {"make_cameras_from_configs": make_cameras_from_configs},
         "lerobot.utils": {},
-        "lerobot.utils.errors": {
-            "DeviceNotConnectedError": DeviceNotConnectedError,
-            "DeviceAlreadyConnectedError": DeviceAlreadyConnectedError,
-        },
+        "lerobot.utils.errors": dict.fromkeys(
+            ("DeviceNotConnectedError", "DeviceAlreadyConnectedError"), ConnectionError
+        ),
         "lerobot.utils.import_utils": {"register_third_party_plugins": register_third_party_plugins},
     }
     for name, content in parts.items():

@@ -8,9 +8,8 @@ know: the true patterns of figures that are on neither plate.
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import shapely
@@ -61,8 +60,7 @@ def plate_mesh(names: Sequence[str]) -> trimesh.Trimesh:
     return cast(trimesh.Trimesh, trimesh.util.concatenate(bodies))
 
 
-@dataclass
-class Tapped:
+class Tapped(NamedTuple):
     """Truth of the taps of a recording, in their order, which only an emulation has."""
 
     indentation_mm: NDArray[np.float32]  # (n,) at full force
@@ -93,9 +91,8 @@ class Robot:
     def record(self, path: Path, surface: Relief, poses: Sequence[Pose]) -> Tapped:
         """Tap a surface at these poses, and write a CSV of the scans, with the poses that the robot states."""
         rows, stated, depths, units = [np.zeros((100, 3, 4, 4))], [np.tile((0.0, 0.0, 0.0), (100, 1))], [], []
-        share = np.concatenate(
-            [np.zeros(FREE), np.linspace(0, 1, RISE + 1)[1:], np.ones(HOLD), np.linspace(1, 0, FALL + 1)[1:]]
-        )
+        rise, fall = np.linspace(0, 1, RISE + 1)[1:], np.linspace(1, 0, FALL + 1)[1:]
+        share = np.concatenate([np.zeros(FREE), rise, np.ones(HOLD), fall])
         for pose in poses:
             true = Pose(*(np.array(pose) + MISPLACED + JITTER * self.rng.standard_normal(3).clip(-2, 2)).tolist())
             size, cell_mm = self.pad.size * SAMPLES, self.pad.cell_mm / SAMPLES
@@ -130,30 +127,22 @@ class Robot:
         """Return readings and true patterns of figures of any name, each at a pose of its own and at these shares."""
         sets = []
         for number, (name, pose) in enumerate(zip(names, random_poses(self.rng, len(names)), strict=True)):
-            one = self.tap(heights_of(name, pose, self.pad)[None])
-            clean = between_frames(one.counts, np.array(shares)[None])[0]
+            one, n = self.tap(heights_of(name, pose, self.pad)[None]), len(shares)
             depth_mm = (one.indentation_mm[0, -1] * np.array(shares)).astype(np.float32)
             unit = resample(one.unit_patterns, FINE_SCALE, SCALE)[0]
-            touching = resample_touching(one.touching, FINE_SCALE, SCALE)
-            sets.append(self._set(name, number, self.read(clean), unit * depth_mm[:, None, None], touching, depth_mm))
+            made = {
+                "family": np.array([name] * n),
+                "pad": np.full(n, number),
+                "constants": np.tile(constants(self.pad.pad), (n, 1)),
+                "counts": self.read(between_frames(one.counts, np.array(shares)[None])[0])[:, None].astype(np.float32),
+                "patterns": (unit * depth_mm[:, None, None]).astype(np.float16),
+                "touching": np.repeat(resample_touching(one.touching, FINE_SCALE, SCALE), n, axis=0),
+                "traction_kpa": np.full((n, 3, 8, 8), np.nan, np.float16),
+                "indentation_mm": depth_mm,
+            }
+            shapes = {"angle_deg": (n, 1), "poses": (n, 1, 3), "force_n": (n, 3), "twist_nmm": (n,)}
+            sets.append(made | {key: np.zeros(shape, np.float32) for key, shape in shapes.items()})
         return PressSet(**{key: np.concatenate([one[key] for one in sets]) for key in sets[0]}, config={"own": True})
-
-    def _set(self, name, number, counts, patterns, touching, depth_mm) -> dict[str, NDArray]:
-        n = len(counts)
-        return {
-            "family": np.array([name] * n),
-            "pad": np.full(n, number),
-            "constants": np.tile(constants(self.pad.pad), (n, 1)),
-            "counts": counts[:, None].astype(np.float32),
-            "angle_deg": np.zeros((n, 1), np.float32),
-            "poses": np.zeros((n, 1, 3), np.float32),
-            "patterns": patterns.astype(np.float16),
-            "touching": np.repeat(touching, n, axis=0),
-            "traction_kpa": np.full((n, 3, 8, 8), np.nan, np.float16),
-            "force_n": np.zeros((n, 3), np.float32),
-            "twist_nmm": np.zeros(n, np.float32),
-            "indentation_mm": depth_mm,
-        }
 
     def save_sensor_file(self, path: Path, known_to: float = KNOWN_TO) -> None:
         """Write what a user knows of the sensor: constants within a share of their range, gains to 2 %."""
@@ -176,7 +165,7 @@ def make(folder: Path, seed: int = 7) -> dict[str, Tapped]:
     for plate, names in PLATES.items():
         plate_mesh(names).export(folder / f"{plate}.stl")
         known[plate] = robot.record_plate(folder / f"{plate}.csv", names)
-        np.savez_compressed(folder / f"{plate}-truth.npz", **vars(known[plate]))
+        np.savez_compressed(folder / f"{plate}-truth.npz", **known[plate]._asdict())
     names = [f"{kind}:{4000 + number}" for number in range(60) for kind in ("glyph", "polygon")]
     robot.presses(names).save(folder / "presses.npz")
     return known

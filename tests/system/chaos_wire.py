@@ -156,11 +156,7 @@ class Stretch(NamedTuple):
 
 
 def stretches(text: str, seed: int) -> list[Stretch]:
-    """Parse faults as a user writes them.
-
-    Raises:
-        ValueError: no such fault, share or time.
-    """
+    """Parse faults as a user writes them; raises ValueError where there is no such fault, share or time."""
     found: list[Stretch] = []
     for part in filter(None, text.split(",")):
         what, _, when = part.partition("@")
@@ -192,18 +188,7 @@ def _mixture(start_s: float, long_s: float, seed: int) -> Iterator[Stretch]:
 
 
 class FaultyBus:
-    """Adapter on a bus with faults, played by an `EmulatorThread` from the first opening of its channel.
-
-    Attributes:
-        line: port of its client.
-        begun: number of stretches that have begun, by fault.
-        handed: number of frames whose whole line was written, foreign ones included.
-        foreign: number of those that are of another device.
-        unread_bytes: number of bytes that a client which closed, or whose cable was pulled, had not fetched.
-        openings: number of times that the channel was opened.
-        back_ns: times at which the adapter could be used again, in [ns].
-        over: True once the whole timeline was played.
-    """
+    """Adapter on a bus with faults, played by an `EmulatorThread` from the first opening of its channel."""
 
     def __init__(
         self,
@@ -215,10 +200,12 @@ class FaultyBus:
     ) -> None:
         """Prepare to play; `on_sent` gets each frame whose line goes out whole, just before it does, with the time."""
         self.line = PseudoPort(link)
-        self.begun = Counter[str]()
-        self.handed = self.foreign = self.unread_bytes = self.openings = 0
-        self.back_ns: list[int] = []
-        self.over = False
+        self.begun = Counter[str]()  # stretches, by fault
+        self.handed = self.foreign = 0  # frames whose whole line was written, and those of them of another device
+        self.unread_bytes = 0  # that a client which closed, or whose cable was pulled, had not fetched
+        self.openings = 0  # of the channel
+        self.back_ns: list[int] = []  # times at which the adapter could be used again
+        self.over = False  # the whole timeline was played
         self._timeline, self._on_sent = timeline, on_sent
         self._adapter = SlcanAdapter()
         self._waiting = [(one, random.Random(f"{seed} {number}")) for number, one in enumerate(faults)]

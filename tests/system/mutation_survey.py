@@ -11,8 +11,6 @@ too.
 import argparse
 import ast
 import gc
-import importlib.abc
-import importlib.machinery
 import importlib.util
 import math
 import os
@@ -22,15 +20,14 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType
+from typing import Any, NamedTuple
 
 import hypothesis
 import numpy as np  # noqa: F401  imported once, before the processes are forked
 import pytest
-from mutants import Mutant, compiled, mutants
 
 from edge.bench.provenance import provenance
 
@@ -41,51 +38,48 @@ STUCK_S = 300
 MEMORY_BYTES = 8 << 30
 WANTED = 0.95
 
-
+PAIRS = ((ast.Lt, ast.LtE), (ast.Gt, ast.GtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot), (ast.In, ast.NotIn))
+COMPARISONS = {before: after for pair in PAIRS for before, after in (pair, pair[::-1])}
+OPERATORS = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.Mult,
+    ast.LShift: ast.RShift,
+    ast.RShift: ast.LShift,
+    ast.BitAnd: ast.BitOr,
+    ast.Pow: ast.Mult,
+    ast.BitOr: ast.BitAnd,
+    ast.BitXor: ast.BitAnd,
+}
+TWINS = {"min": "max", "max": "min", "any": "all", "all": "any"}
+"""Functions and methods that are taken for each other."""
 _TEXT = (
     "Each mutant is the module with one change: a comparison, an operator, a condition, a number, a result, or a "
     "statement that is left out; texts, annotations and what errors are raised with stay. It is noticed where a test "
     "of the module's own test files fails, or takes far too long. Possible: all changes of the module; tried: those "
     "drawn by chance, less those that behave as the code does, which are listed beside the survey with their reasons."
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Subject:
-    """A module and its unit tests: files, and other arguments of pytest."""
-
-    module: str
-    tests: tuple[str, ...]
-
-    @property
-    def path(self) -> Path:
-        """The module's file."""
-        return ROOT / (self.module.replace(".", "/") + ".py")
-
-
 SUBJECTS = {
-    "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py",)),
-    "gs_usb": Subject("firmware_bridge.can.gs_usb", ("tests/bridge/test_gs_usb.py",)),
-    "assembler": Subject(
+    "slcan": ("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py",)),
+    "gs_usb": ("firmware_bridge.can.gs_usb", ("tests/bridge/test_gs_usb.py",)),
+    "assembler": (
         "firmware_bridge.scans.scan_assembler",
-        (
-            "tests/bridge/test_scan_assembler.py",
-            "tests/bridge/test_slcan_scans.py",
-            "tests/bridge/test_cycles.py",
-        ),
+        ("tests/bridge/test_scan_assembler.py", "tests/bridge/test_slcan_scans.py", "tests/bridge/test_cycles.py"),
     ),
-    "taps": Subject(
+    "taps": (
         "edge.perception.taps",
         ("tests/runtime/test_taps.py", "tests/runtime/test_pose_runtime.py", "tests/runtime/test_baseline_doubt.py"),
     ),
-    "baseline": Subject("firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py",)),
-    "drift": Subject("firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift.py",)),
-    "contract": Subject(
+    "baseline": ("firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py",)),
+    "drift": ("firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift.py",)),
+    "contract": (
         "edge.inference.contract",
         ("tests/runtime/test_contract.py", "tests/bridge/test_pad.py", "tests/runtime/test_session.py"),
     ),
 }
-
 EQUIVALENT: dict[str, dict[str, str]] = {
     "assembler": {
         "_end_of_run: self._taxels and self._gap_ns(time_ns, own_ns, at) > wire.pause_ns -> "
@@ -114,47 +108,103 @@ EQUIVALENT: dict[str, dict[str, str]] = {
 """Mutants by subject that behave as the code does, each with the reason; left out of the score."""
 
 
-@dataclass(frozen=True, slots=True)
-class Score:
+class Mutant(NamedTuple):
+    """One change of a syntax tree."""
+
+    name: str  # "function or constant: code before -> code after", the same wherever that stands in its file
+    line: int
+    siblings: Any  # list, or attributes of a node, of which one is changed
+    place: str | int  # which
+    changed: ast.AST  # what comes there
+
+    def compiled(self, tree: ast.Module, path: Path) -> CodeType:
+        """Return the code of its tree with this change, which does not last."""
+        before, self.siblings[self.place] = self.siblings[self.place], self.changed
+        try:
+            return compile(ast.fix_missing_locations(tree), path, "exec")
+        finally:
+            self.siblings[self.place] = before
+
+
+def mutants(node: ast.AST, function: str = "module") -> Iterator[Mutant]:
+    """Yield all changes below a node.
+
+    Texts are left as they are, and so are annotations, decorators and what an error is raised with: unit tests rightly
+    do not hold every word.
+    """
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        function = node.name
+    elif function == "module" and isinstance(node, ast.Assign | ast.AnnAssign):
+        function = ast.unparse(node.target if isinstance(node, ast.AnnAssign) else node.targets[0])
+    if isinstance(node, ast.Raise | ast.JoinedStr):
+        return
+    for field, value in ast.iter_fields(node):
+        if field in {"annotation", "returns", "decorator_list"}:
+            continue
+        siblings, places = (value, range(len(value))) if isinstance(value, list) else (vars(node), [field])
+        for place in places:
+            child = siblings[place]
+            if isinstance(child, ast.expr | ast.stmt):
+                for changed in changes(child):
+                    before, after = (ast.unparse(ast.fix_missing_locations(one)) for one in (child, changed))
+                    name = f"{function}: {before.splitlines()[0]} -> {after.splitlines()[0]}"
+                    yield Mutant(name, child.lineno, siblings, place, changed)
+            if isinstance(child, ast.AST):
+                yield from mutants(child, function)
+
+
+def changes(node: ast.expr | ast.stmt) -> Iterator[ast.AST]:
+    """Yield what may come in place of a node: nothing, another value, or the same with another part."""
+
+    def with_other(**parts: Any) -> ast.AST:
+        return type(node)(**(dict(ast.iter_fields(node)) | parts))
+
+    match node:
+        case ast.Constant(value=bool(value)):
+            yield ast.Constant(not value)
+        case ast.Constant(value=int(value)) | ast.Constant(value=float(value)):
+            yield ast.Constant(value + 1)
+        case ast.Constant(value=bytes(value)) if value:
+            yield ast.Constant(b"?" + value[1:])
+        case ast.UnaryOp(op=ast.Not() | ast.USub() | ast.Invert(), operand=operand):
+            yield operand
+        case ast.Return(value=ast.expr() as value) if not (isinstance(value, ast.Constant) and value.value is None):
+            yield ast.Return(ast.Constant(None))
+        case ast.Expr(value=ast.Call()) | ast.AugAssign() | ast.Raise() | ast.Continue() | ast.Break():
+            yield ast.Pass()
+        case ast.Assign(targets=[ast.Attribute() | ast.Subscript()]):
+            yield ast.Pass()
+    match node:
+        case ast.Compare(ops=ops):
+            for index, operator in enumerate(ops):
+                yield with_other(ops=[*ops[:index], COMPARISONS[type(operator)](), *ops[index + 1 :]])
+        case ast.BinOp(op=operator) | ast.AugAssign(op=operator) if type(operator) in OPERATORS:
+            yield with_other(op=OPERATORS[type(operator)]())
+        case ast.BoolOp(op=operator):
+            yield with_other(op=ast.Or() if isinstance(operator, ast.And) else ast.And())
+        case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test):
+            yield with_other(test=ast.UnaryOp(ast.Not(), test))
+        case ast.Call(func=ast.Name(id=name)) if name in TWINS:
+            yield with_other(func=ast.Name(TWINS[name], ast.Load()))
+        case ast.Call(func=ast.Attribute(value=value, attr=name)) if name in TWINS:
+            yield with_other(func=ast.Attribute(value, TWINS[name], ast.Load()))
+
+
+class Score(NamedTuple):
     """Outcome of one module's mutants."""
 
     subject: str
     possible: int
-    noticed: int
-    survivors: tuple[Mutant, ...]
-
-    @property
-    def tried(self) -> int:
-        """Mutants that were tried."""
-        return self.noticed + len(self.survivors)
+    tried: int
+    survivors: list[Mutant]
 
 
-class _InPlaceOf(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Importer of a module with other code than its file's."""
-
-    def __init__(self, subject: Subject, code: CodeType) -> None:
-        self._subject, self._code = subject, code
-
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> importlib.machinery.ModuleSpec | None:
-        if fullname != self._subject.module:
-            return None
-        return importlib.util.spec_from_file_location(fullname, self._subject.path, loader=self)
-
-    def create_module(self, spec: importlib.machinery.ModuleSpec) -> None:
-        return None
-
-    def exec_module(self, module: ModuleType) -> None:
-        exec(self._code, module.__dict__)
-
-
-def passes(subject: Subject, code: CodeType, limit_s: int) -> tuple[bool, float]:
+def passes(subject: str, code: CodeType, limit_s: int) -> tuple[bool, float]:
     """Return if the module's tests pass with this code in so much processor time, and the time they took in [s]."""
     gc.freeze()
     child = os.fork()
     if child == 0:
-        _run_tests(subject, code, limit_s)
+        _run_tests(*SUBJECTS[subject], code, limit_s)
     ends = time.monotonic() + STUCK_S
     while time.monotonic() < ends:
         ended, status, usage = os.wait4(child, os.WNOHANG)
@@ -166,8 +216,8 @@ def passes(subject: Subject, code: CodeType, limit_s: int) -> tuple[bool, float]
     return False, math.inf
 
 
-def _run_tests(subject: Subject, code: CodeType, limit_s: int) -> None:
-    """Run them and end this process."""
+def _run_tests(name: str, tests: Sequence[str], code: CodeType, limit_s: int) -> None:
+    """Run the tests of a module that is made of this code, and end this process."""
     status = 1
     try:
         os.setsid()
@@ -180,53 +230,50 @@ def _run_tests(subject: Subject, code: CodeType, limit_s: int) -> None:
         phases = (hypothesis.Phase.explicit, hypothesis.Phase.generate)
         hypothesis.settings.register_profile("survey", derandomize=True, database=None, phases=phases, deadline=None)
         hypothesis.settings.load_profile("survey")
-        sys.meta_path.insert(0, _InPlaceOf(subject, code))
-        status = pytest.main(["-x", "-n", "0", "-p", "no:cacheprovider", *subject.tests])
+        spec = importlib.util.find_spec(name)
+        module = sys.modules[name] = importlib.util.module_from_spec(spec)
+        setattr(sys.modules[spec.parent], name.rpartition(".")[2], module)
+        exec(code, vars(module))
+        status = pytest.main(["-x", "-n", "0", "-p", "no:cacheprovider", *tests])
     finally:
         os._exit(int(status))
 
 
 def survey(name: str, most: int, seed: int) -> Score:
-    """Try a module's mutants, at most so many, drawn by chance.
-
-    Raises:
-        SystemExit: the tests fail on the code as it is.
-    """
-    subject = SUBJECTS[name]
-    tree = ast.parse(subject.path.read_text(encoding="utf-8"))
-    passed, taken_s = passes(subject, compile(tree, str(subject.path), "exec"), STUCK_S)
+    """Try a module's mutants, at most so many, drawn by chance; end where its tests fail on the code as it is."""
+    module, tests = SUBJECTS[name]
+    path = ROOT / (module.replace(".", "/") + ".py")
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    passed, taken_s = passes(name, compile(tree, path, "exec"), STUCK_S)
     if not passed:
-        sys.exit(f"{name}: the tests fail on the code unchanged: run {' '.join(subject.tests)}")
+        sys.exit(f"{name}: the tests fail on the code unchanged: run {' '.join(tests)}")
     limit_s = math.ceil(max(LEAST_LIMIT_S, SLOWER * taken_s))
-    possible = mutants(tree)
+    possible = sorted(mutants(tree), key=lambda mutant: mutant.line)
     drawn = random.Random(seed).sample(possible, min(most, len(possible)))
     drawn = [mutant for mutant in drawn if mutant.name not in EQUIVALENT.get(name, {})]
     survivors = []
     for mutant in drawn:
-        if passes(subject, compiled(tree, mutant, str(subject.path)), limit_s)[0]:
+        if passes(name, mutant.compiled(tree, path), limit_s)[0]:
             survivors.append(mutant)
             sys.stderr.write(f"{name}:{mutant.line} {mutant.name}\n")
-    survivors.sort(key=lambda mutant: mutant.line)
-    return Score(name, len(possible), len(drawn) - len(survivors), tuple(survivors))
+    return Score(module, len(possible), len(drawn), sorted(survivors, key=lambda mutant: mutant.line))
 
 
-def page(scores: Sequence[Score], seed: int) -> str:
+def page(names: Sequence[str], scores: Sequence[Score], seed: int) -> str:
     """Return the report."""
-    names = [score.subject for score in scores]
-    tests = [path for name in names for path in SUBJECTS[name].tests]
+    tests = [path for name in names for path in SUBJECTS[name][1]]
     command = shlex.join(["python", "tests/system/mutation_survey.py", *sys.argv[1:]])
     lines = ["# Mutation", "", str(provenance(command, [__file__, *tests], seed=seed)), "", _TEXT, ""]
     lines += ["| module | possible | tried | noticed | score |", "|---|---|---|---|---|"]
-    lines += [
-        f"| {SUBJECTS[score.subject].module} | {score.possible} | {score.tried} | {score.noticed} "
-        f"| {100 * score.noticed / score.tried:.1f} % |"
-        for score in scores
-    ]
-    noticed, tried = (sum(getattr(score, key) for score in scores) for key in ("noticed", "tried"))
+    for module, possible, tried, survivors in scores:
+        noticed = tried - len(survivors)
+        lines.append(f"| {module} | {possible} | {tried} | {noticed} | {100 * noticed / tried:.1f} % |")
+    tried = sum(score.tried for score in scores)
+    noticed = tried - sum(len(score.survivors) for score in scores)
     lines += ["", f"Together {noticed} of {tried}, {100 * noticed / tried:.1f} %; {100 * WANTED:.0f} % are wanted.", ""]
     for score in scores:
         if score.survivors:
-            lines += [f"## Survivors in {SUBJECTS[score.subject].module}", ""]
+            lines += [f"## Survivors in {score.subject}", ""]
             lines += [f"- line {mutant.line}, `{mutant.name}`" for mutant in score.survivors] + [""]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -240,11 +287,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="report (default: on stdout)")
     options = parser.parse_args(arguments)
     os.chdir(ROOT)
-    scores: list[Score] = []
-    text = ""
-    for name in options.names or SUBJECTS:
+    names, scores, text = options.names or [*SUBJECTS], list[Score](), ""
+    for name in names:
         scores.append(survey(name, options.mutants, options.seed))
-        text = page(scores, options.seed)
+        text = page(names[: len(scores)], scores, options.seed)
         if options.out is not None:  # what has been surveyed is kept where the run is broken off
             options.out.write_text(text, encoding="utf-8")
     if options.out is None:
