@@ -11,9 +11,11 @@ import ipaddress
 import re
 import secrets
 import socket
+import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from fcntl import ioctl
 from http import HTTPStatus
 from typing import Final
 from urllib.parse import parse_qs
@@ -118,9 +120,17 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return None
 
 
+# The kernel's `ifreq` with an IPv4 address: name of the interface, family and port, address; room for other uses.
+_REQUEST: Final = struct.Struct("16s4x4s232x")
+
+
 def own_addresses() -> list[str]:
-    """Return the IPv4 address at which others reach this machine, of the network that leads elsewhere, if any does."""
+    """Return the IPv4 addresses of this machine at which others on its networks reach it."""
+    addresses: list[str] = []
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        asked.connect(("192.0.2.1", 9))  # of documentation; nothing is sent
-        return [asked.getsockname()[0]]
-    return []
+        for _, name in socket.if_nameindex():
+            with suppress(OSError):  # SIOCGIFADDR of an interface without an IPv4 address
+                answer = ioctl(asked, 0x8915, _REQUEST.pack(name.encode(), bytes(4)))
+                addresses.append(socket.inet_ntoa(_REQUEST.unpack(answer)[1]))
+    usable = (ip for ip in map(ipaddress.ip_address, addresses) if not (ip.is_loopback or ip.is_link_local))
+    return list(dict.fromkeys(map(str, usable)))
