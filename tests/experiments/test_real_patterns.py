@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge.api import infer
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from train.data.real_grips import (
@@ -61,3 +62,21 @@ def test_several_taps_of_a_face_anywhere_on_it_stay_one_sheet(played):
             pattern = model.run(model.contract.scale_window(scans), poses=poses.astype(np.float32))[None]
             assert share_touched(pattern)[0] >= LEAST_SHARE and unevenness(pattern)[0] <= MOST_UNEVEN, name
             assert name.startswith(DENTED) or not has_hole(pattern)[0], name
+
+
+def test_two_pads_of_one_grip_carry_equal_and_opposite_forces():
+    """By the wrench as nearly as by the plain sums of counts, which know nothing of patterns."""
+    grips = [replace(one, counts=one.counts[::2]) for one in recorded_grips(RECORDINGS)]
+    for trial in dict.fromkeys(grip.trial for grip in grips):
+        pads = [(infer(DEFAULT_MODEL, grip.counts, grip.free), grip) for grip in grips if grip.trial == trial]
+        scans = min(len(results) for results, _ in pads)
+        sums = np.array([(grip.counts - grip.free.counts).sum(axis=(2, 3))[:scans] for _, grip in pads])
+        none = (np.nan,) * 3
+        forces = np.array(
+            [[none if one.wrench is None else one.wrench.force_n for one in results[:scans]] for results, _ in pads]
+        )
+        held = (sums[:, :, 2] > 6000).all(axis=0) & np.isfinite(forces).all(axis=(0, 2))  # surely held
+        assert held.sum() > 50, trial
+        mirrored, mirrored_counts = (np.corrcoef(*one[:, held, 1])[0, 1] for one in (forces, sums))
+        scatter, scatter_counts = (np.divide(*one[:, held, 2]).std() for one in (forces, sums))
+        assert mirrored < mirrored_counts + 0.15 and scatter < 1.2 * scatter_counts, trial

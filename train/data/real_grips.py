@@ -20,10 +20,11 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
-from firmware_bridge.scans.scan import ScanSeries
+from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from train.errors import DatasetError
+from train.physics.sensor_noise import neighbours
 
 REST_SCANS: Final = 20  # scans at the end of a recording, where one of the grips has been released
 _Z: Final = AXES.index("z")
@@ -43,6 +44,11 @@ class Grip:
     def zeroed(self) -> NDArray[np.float32]:
         """Return the scans over the free pad, along the pad's axes."""
         return np.stack([deformation(scan, self.free, self.mounting) for scan in self.counts])
+
+
+def z_of(counts: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return readings of z, (n, taxels), from scans (n, 3, rows, cols)."""
+    return counts[:, _Z].reshape(len(counts), -1)
 
 
 def loaded(counts: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -138,15 +144,21 @@ def recorded_contacts(folder: Path, known: SensorFile = _UNKNOWN) -> dict[str, N
     return {sensor: np.concatenate(parts) for sensor, parts in contacts.items()}
 
 
+def neighbours_mean(z: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the mean of each taxel's edge neighbours, (n, taxels): bilinear at its place, with fewer at the rim."""
+    beside = neighbours(USPA44.rows, USPA44.cols) > 0
+    return z @ (beside / beside.sum(axis=0))
+
+
 class Played(NamedTuple):
-    """Output of the runtime for the scans of one grip that are under load."""
+    """Output of the runtime for the scans of one grip that are under load: zeroed counts without a hidden taxel."""
 
     zeroed: NDArray[np.float32]
     patterns: NDArray[np.float32]  # (n, H, W) in [mm], NaN where there was none
     believed: NDArray[np.bool_]  # (n,) unless any reason spoke against it
 
 
-def play(grip: Grip, model: ModelSession, pad: Pad | None = None) -> Played:
+def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | None = None) -> Played:
     """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred."""
     name = grip.free.sensor
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
@@ -158,6 +170,8 @@ def play(grip: Grip, model: ModelSession, pad: Pad | None = None) -> Played:
     none = np.full(model.contract.pattern_shape, np.nan, dtype=np.float32)
     patterns, believed = [], []
     for number, raw in enumerate(grip.counts.astype(np.int32)):
+        if hidden is not None:
+            raw.reshape(3, -1)[:, hidden] = ABSENT
         result = runtime.push(series.close(raw, number * 16_750_000))
         patterns.append(none if result.pattern is None else result.pattern)
         believed.append(result.trusted is not False)
