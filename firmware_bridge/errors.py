@@ -98,6 +98,13 @@ class SourceError(BridgeError, ValueError):
     """A text that names no source."""
 
 
+def interrupted(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C came, also where what it cut off failed then: zipfile closes no archive in mid-array."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
+
+
 def how_to_install(extra: str) -> str:
     """Return the command that installs an extra of pyproject.toml, for the message that it is missing.
 

@@ -152,7 +152,7 @@ def test_a_full_disk_and_ctrl_c_leave_nothing(tmp_path):
         assert [path.name for path in tmp_path.iterdir()] == ["press.mcap"]
     command = [sys.executable, "-c", RUN, str(10**9), "press.mcap", "new.npz"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        while not list(tmp_path.glob(".new.npz.*/new.npz")) and process.poll() is None:
+        while not any(path.stat().st_size for path in tmp_path.glob(".new.npz.*/new.npz")) and process.poll() is None:
             time.sleep(0.001)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
