@@ -1,5 +1,4 @@
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -8,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from edge_samples import ROOT
 from press_samples import make_press_set
 
 from edge.evaluation.metrics import psnr_db
@@ -267,47 +265,3 @@ def test_a_loss_that_is_no_number_ends_the_run_before_its_step(tmp_path):
     with pytest.raises(DivergedError, match="step 0: lower the learning rate"):
         train(net, RelativeError(), poisoned, RECIPE, tmp_path / "net.resume")
     assert torch.equal(before, weights(net))
-
-
-WORKER = """
-import os, sys, json, torch
-from dataclasses import replace
-sys.path[:0] = ["tests/training", "tests/support"]
-from pathlib import Path
-from test_training import batches, new_net, weights, RECIPE
-from train.learning.training_loop import leave_group, rank_and_world, train
-from train.networks.blocks import RelativeError
-net, used = new_net(), []
-def recorded(number):
-    used.append(number)
-    return batches(number)
-train(net, RelativeError(), recorded, RECIPE, Path(sys.argv[1]) / "net.resume")
-try:
-    train(new_net(), RelativeError(), batches, replace(RECIPE, batch=5), Path(sys.argv[1]) / "odd.resume")
-except ValueError as error:
-    refused = str(error)
-rank, world = rank_and_world()
-cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-told = json.dumps([rank, world, used, weights(net).tolist(), cores, refused])
-Path(f"{sys.argv[1]}/rank{rank}.json").write_text(told)
-leave_group()
-"""
-
-
-@pytest.mark.night
-def test_two_processes_share_every_batch_and_end_where_one_does(tmp_path):
-    (tmp_path / "worker.py").write_text(WORKER)
-    command = ["torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0", "--rdzv-backend", "c10d"]
-    command += ["--rdzv-endpoint", "localhost:0", str(tmp_path / "worker.py"), str(tmp_path)]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", *command], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    first, second = (json.loads((tmp_path / f"rank{rank}.json").read_text()) for rank in range(2))
-    assert (first[0], second[0], first[1]) == (0, 1, 2)
-    assert first[2] == second[2] == list(range(12))
-    assert first[3] == second[3] and "5 windows is shared by 2 processes" in first[5]
-    assert first[3] == pytest.approx(weights(trained(tmp_path)).tolist(), abs=1e-5)
-    if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) > 1 and not torch.cuda.is_available():
-        assert first[4] and second[4] and not set(first[4]) & set(second[4]), "two processes on one core wait for it"

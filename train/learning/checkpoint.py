@@ -25,16 +25,7 @@ from train.data.press_batches import Batch, OneSensor, PosedBatches, PressBatche
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
 from train.learning.interval_fit import calibrate, interval_coverage
-from train.learning.training_loop import (
-    DAMAGES,
-    Recipe,
-    device_of_rank,
-    rank_and_world,
-    reason,
-    train,
-    wait_for_all,
-    write_state,
-)
+from train.learning.training_loop import DAMAGES, Recipe, best_device, reason, train, write_state
 from train.networks.blocks import Objective, PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.named_networks import build, grown
@@ -91,8 +82,7 @@ def fit_network(
         if start_path is None
         else grown(load_network(start_path)[0], training.network, training.scale, **training.options)
     )
-    rank, world = rank_and_world()
-    device = device_of_rank(rank)
+    device = best_device()
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
     recipe = training.recipe
     batches = batches_of(data, training.scale, recipe, seed, posed=net.takes_poses, sensor=training.sensor)
@@ -120,18 +110,15 @@ def fit_network(
         "steps": recipe.steps,
         "elapsed_s": round(elapsed_s, 1),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.machine()} processor",
-        "processes": world,
         "threads": torch.get_num_threads(),
         **_evaluated(net, validation),
         "course": course,
     }
-    if rank == 0:
-        # The report is written last, so that it never describes weights that do not exist.
-        text = json.dumps(report, indent=1) + "\n"
-        write_state(path, net.state_dict())
-        write_in_place(path.with_suffix(".json"), lambda draft: draft.write_text(text), lambda draft: draft.read_text())
-        resume_path.unlink(missing_ok=True)
-    wait_for_all()
+    # The report is written last, so that it never describes weights that do not exist.
+    text = json.dumps(report, indent=1) + "\n"
+    write_state(path, net.state_dict())
+    write_in_place(path.with_suffix(".json"), lambda draft: draft.write_text(text), lambda draft: draft.read_text())
+    resume_path.unlink(missing_ok=True)
     return report
 
 

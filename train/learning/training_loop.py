@@ -1,17 +1,11 @@
-"""Training loop for every network: mixed precision, several devices, resumable, and reproducible for one seed.
+"""Training loop for every network: mixed precision, resumable, and reproducible for one seed.
 
-On a GPU a seed reproduces the weights up to the order of additions.
-
-Under torchrun every process takes its share of each batch, and gradients are averaged: the weights are those of one
-process up to the order of additions, except for batch normalisation, which sees the share alone.
-
-    torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/train.npz
+One process uses all cores, or one GPU, on which a seed reproduces the weights up to the order of additions.
 """
 
 import hashlib
 import io
 import json
-import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -21,8 +15,7 @@ from pickle import UnpicklingError
 from typing import Any, Final
 
 import torch
-from torch import distributed, nn
-from torch.nn.parallel import DistributedDataParallel
+from torch import nn
 
 from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
@@ -55,7 +48,7 @@ class Recipe:
     """Hyperparameters of a training."""
 
     steps: int  # of the optimizer
-    batch: int = 64  # windows, shared by all devices
+    batch: int = 64  # windows
     learning_rate: float = 2e-3  # highest of the one cycle
     weight_decay: float = 0.0  # of AdamW
     clip_norm: float = 1.0  # largest norm of a gradient
@@ -68,29 +61,6 @@ class Recipe:
                 raise CheckpointError(f"{name} is {value}, expected more than 0")
 
 
-def rank_and_world() -> tuple[int, int]:
-    """Return the rank of this process and the number of processes; joins torchrun's group on the first call."""
-    if "WORLD_SIZE" not in os.environ:
-        return 0, 1
-    if not distributed.is_initialized():
-        distributed.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-        _keep_apart(int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"]))  # ranks on this machine
-    return distributed.get_rank(), distributed.get_world_size()
-
-
-def _keep_apart(rank: int, world: int) -> None:
-    """Pin one of several processes of a machine without a GPU to its share of the available cores.
-
-    Without it the kernel kept two processes on one core for minutes, while the other core was idle.
-    """
-    if world == 1 or torch.cuda.is_available() or not hasattr(os, "sched_setaffinity"):
-        return
-    cores = sorted(os.sched_getaffinity(0))
-    share = cores[rank * len(cores) // world : (rank + 1) * len(cores) // world]
-    if share:  # with more processes than cores, the kernel schedules them
-        os.sched_setaffinity(0, share)
-
-
 def gains_by_bf16(device: torch.device) -> bool:
     """Return True if a device multiplies in bfloat16 natively; others emulate it slowly."""
     if device.type == "cuda":
@@ -99,22 +69,9 @@ def gains_by_bf16(device: torch.device) -> bool:
     return bool(able.get("avx512_bf16") or able.get("amx_bf16") or able.get("bf16"))
 
 
-def wait_for_all() -> None:
-    """Wait until all processes have reached this point."""
-    if distributed.is_initialized():
-        distributed.barrier()
-
-
-def leave_group() -> None:
-    """End torchrun's group with all processes at once: one that leaves first would close the others' connections."""
-    if distributed.is_initialized():
-        wait_for_all()
-        distributed.destroy_process_group()
-
-
-def device_of_rank(rank: int) -> torch.device:
-    """Return the device on which a process computes."""
-    return torch.device("cuda", rank % torch.cuda.device_count()) if torch.cuda.is_available() else torch.device("cpu")
+def best_device() -> torch.device:
+    """Return the GPU if there is one, else the processor."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def learning_rate_share(progress: float) -> float:
@@ -139,22 +96,15 @@ def train(
     Returned are the seconds that all parts of the run took, and the loss of a hundred steps by their numbers.
 
     An interrupted run resumes when this is called again with the same `identity`, of network and data, from the state
-    in `resume_path`, which the caller deletes when the result is safe. CheckpointError if a batch cannot be shared
-    evenly by the processes, DivergedError if the loss is not finite; the network is then as before that step.
+    in `resume_path`, which the caller deletes when the result is safe. DivergedError if the loss is not finite; the
+    network is then as before that step.
     """
-    rank, world = rank_and_world()
-    if recipe.batch % world:
-        raise CheckpointError(
-            f"a batch of {recipe.batch} windows is shared by {world} processes: expected as many for each"
-        )
-    device = device_of_rank(rank)
+    device = best_device()
     _place(net, device).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
-    parallel = DistributedDataParallel(net) if world > 1 else net
     parts = {"net": net, "optimizer": optimizer, "objective": objective}
     recipe_sha256 = hashlib.sha256(json.dumps([asdict(recipe), identity], sort_keys=True).encode()).hexdigest()
     state = _restored(resume_path, parts, recipe_sha256, device)
-    wait_for_all()  # the first process to finish may delete the state
     first, kept_s = state["step"], time.monotonic()
     started_s = kept_s - state["elapsed_s"]
     course: dict[int, float] = state["course"]
@@ -163,9 +113,9 @@ def train(
             rate = recipe.learning_rate * learning_rate_share((step - 1) / recipe.steps)
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            batch = batches(step - 1).share(rank, world, device)
+            batch = batches(step - 1).to(device)
             with torch.autocast(device.type, torch.bfloat16, enabled=recipe.bf16 and gains_by_bf16(device)):
-                descended = objective.loss(parallel, batch)
+                descended = objective.loss(net, batch)
             optimizer.zero_grad()
             descended.backward()
             norm = float(nn.utils.clip_grad_norm_(net.parameters(), recipe.clip_norm))
@@ -179,7 +129,7 @@ def train(
                 course[step] = round(loss, 5)
                 bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
             now_s = time.monotonic()
-            if rank == 0 and now_s - kept_s > keep_every_s:
+            if now_s - kept_s > keep_every_s:
                 facts = {"recipe": recipe_sha256, "step": step, "elapsed_s": now_s - started_s, "course": course}
                 _keep(resume_path, parts, facts)
                 kept_s = time.monotonic()

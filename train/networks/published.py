@@ -17,7 +17,7 @@ The paper's own pad and schedule make the presses to train them on:
 from typing import Any, Final
 
 import torch
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from train.data.press_batches import Batch
@@ -202,7 +202,6 @@ class SrganObjective(Objective):
         for _ in range(2):
             self._optimizer.zero_grad()
             self.critic_loss(*self._seen).backward()
-            _average_gradients(self.critic)
             self._optimizer.step()
         self._seen = None
 
@@ -225,13 +224,3 @@ class SrganObjective(Objective):
         self.critic.load_state_dict(state["critic"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._rng.set_state(state["rng"].cpu())
-
-
-def _average_gradients(net: nn.Module) -> None:
-    """Average gradients over the processes of a run, because DDP does not support the gradient of a gradient."""
-    if not distributed.is_initialized():
-        return
-    for parameter in net.parameters():
-        if parameter.grad is not None:
-            distributed.all_reduce(parameter.grad)
-            parameter.grad /= distributed.get_world_size()
