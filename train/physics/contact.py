@@ -6,11 +6,10 @@ readings then change continuously while the surface moves, where whole cells alo
 (docs/decisions.md).
 
 Friction follows from the pressure, and the slide and turn of the surface since first contact. A cell in contact sticks,
-and moves with the surface, or slips, and bears the traction mu p against its slip (Coulomb; Cattaneo 1938 and Mindlin
-1949 for spheres). One step of monotone loading: pressure first, then slide and twist together, without history. That is
-a convex problem: the least of 1/2 t C t - t g over tractions with |t| <= mu p in each cell, C the pad's compliance and
-g the surface's movement. It is solved by spectral projected gradients (Birgin, Martinez and Raydan 2000), with one
-product with C per step. Slopes of the surface are taken as small. Friction does not resist here that pressure alone
+and moves with the surface, or slips, and bears the traction mu p against its slip (Coulomb). One step of monotone
+loading: pressure first, then slide and twist together, without history. That is a convex problem: the least of
+1/2 t C t - t g over tractions with |t| <= mu p in each cell, C the pad's compliance and g the surface's movement, by
+spectral projected gradients (Birgin, Martinez and Raydan 2000). Friction does not resist here that pressure alone
 spreads the surface, and the effect of traction on pressure is left out (Goodman 1962): exact for a thick layer of nu =
 0.5, while the pressure under a wide contact on a bonded one would lean by some tens of per cent.
 """
@@ -55,10 +54,7 @@ class Cover:
         return np.maximum(spread[:size, :size], 0).astype(np.float32)
 
     def _spread(self, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the share of a pressure wave that a cloth transmits: (1 + q t) exp(-q t).
-
-        Source: Johnson 1985, Eq. 2.23, the pressure at a depth in a half-space.
-        """
+        """Return the share of a pressure wave that a cloth transmits, (1 + q t) exp(-q t): Johnson 1985, Eq. 2.23."""
         depth = q_per_mm * self.cloth_mm
         return (1 + depth) * np.exp(-depth)
 
@@ -66,11 +62,8 @@ class Cover:
 BARE: Final = Cover()
 
 _MAX_STEPS: Final = 200
+# Depth in indentations up to which cells may touch: next to a contact the pad bulges, by at most 0.39 of it.
 REACH: Final = 1.5
-"""Depth in indentations up to which cells may touch.
-
-The pad bulges next to a contact, by at most 0.39 of the indentation over the 18 surfaces.
-"""
 
 
 class ContactSolver:
@@ -110,15 +103,10 @@ class ContactSolver:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Press surfaces into the pad, and return the pressures (n, size, size) in [MPa] and the residuals (n,).
 
-        A residual is the RMS gap where pressure acts or surfaces overlap, over the indentation.
-        For flat surfaces the solution is linear in the indentation: one solve serves all depths of a tap.
-
-        Args:
-            depth_mm: (n, size, size), depth of each cell below the point of first contact, in [mm].
-            indentation_mm: indentation of that point, one for all or (n,), > 0, in [mm].
-            tolerance: residual at which a solution is good enough.
-            covered: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
-                everywhere if None. Pressures are then means over cells.
+        Depths (n, size, size) are below the point of first contact, whose indentation is above 0, one for all or (n,).
+        `covered`, (n, size, size), is the share of each cell that the surface covers, above 0 wherever a cell is
+        reached; None for 1 everywhere. Pressures are means over cells. A residual is the RMS gap where pressure acts or
+        surfaces overlap, over the indentation.
         """
         indentation = np.broadcast_to(np.asarray(indentation_mm, dtype=np.float64), len(depth_mm))
         pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
@@ -212,8 +200,7 @@ def _rms(maps: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
     return torch.sqrt((maps**2).sum(dim=(1, 2)) / where.sum(dim=(1, 2)).clamp_min(1))
 
 
-_REMEMBERED: Final = 4
-"""Number of past energies whose largest a step may not exceed: the method does not descend at every step."""
+_REMEMBERED: Final = 4  # past energies whose largest a step may not exceed: the method does not descend at every step
 
 
 class FrictionSolver:

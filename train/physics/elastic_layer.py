@@ -4,9 +4,8 @@ The pad is a soft layer of thickness h on a rigid board. A pressure wave p exp(i
 material by u_z = W(q, z) p and u_x = i U(q, z) p along the wave. All formulas use decaying exponentials only, so that
 no q h overflows. Lengths in [mm], stresses in [MPa].
 
-On a grid over a pad, displacement is a convolution of the loads, done by FFT on a padded grid. Only the bounding box of
-the cells that a press can reach is computed: the kernel is the whole pad's, cut to the box, so the result is that of
-the whole pad. Presses with boxes of one shape are solved in a batch.
+On a grid over a pad, displacement is a convolution of the loads, done by FFT on a padded grid, on the bounding box of
+the cells that a press can reach alone. Presses with boxes of one shape are solved in a batch.
 
 The free sides of a pad are absent from the infinite layer: near them it is softer and bulges outwards. The effect of a
 load on a side falls with the load's distance d' from the side, and spreads along it by a bell curve. The added
@@ -34,8 +33,8 @@ class Layer:
 
     thickness_mm: float = 4.5  # h
     shear_modulus_mpa: float = 0.12  # G
-    poisson: float = 0.45  # nu, below 0.5
-    """Effective value, because a 20 mm pad is free at its sides: at 0.49 z and force would not be proportional."""
+    # nu, below 0.5; an effective value, as a 20 mm pad is free at its sides: at 0.49 z would not be as the force.
+    poisson: float = 0.45
 
     def __post_init__(self) -> None:
         if not 0 <= self.poisson < 0.5:
@@ -45,7 +44,6 @@ class Layer:
 
 
 Array = NDArray[np.float64]
-
 
 _LONGEST: Final = 1e-8  # q h below which a closed form is its limit: exact to a^2 / (1 - 2 nu)
 
@@ -103,15 +101,11 @@ def inner_displacement(layer: Layer, q_per_mm: Array, height_mm: float) -> tuple
 
 
 class TangentialResponse(NamedTuple):
-    """Displacement per tangential traction at one height, of waves of any shape, in [mm/MPa].
+    """Displacement per tangential traction at one height, of waves of any shape, in [mm/MPa]."""
 
-    `along` and `across` the wave are in the plane, under traction in that direction. i times `sunk` is the displacement
-    downwards under traction along the wave: on top, by reciprocity, -U of `inner_displacement`.
-    """
-
-    along: Array
-    across: Array
-    sunk: Array
+    along: Array  # the wave, as the traction
+    across: Array  # the wave, as the traction
+    sunk: Array  # i times this is downwards, under traction along the wave
 
 
 def inner_tangential(layer: Layer, q_per_mm: Array, height_mm: float) -> TangentialResponse:
@@ -129,8 +123,7 @@ def _inside(
 ) -> tuple[Array, Array]:
     """Return the displacement (w, u) in [mm] inside the layer: u_z = w exp(i q x), upwards, and u_x = i u exp(i q x).
 
-    Each wave solves four boundary conditions: no displacement on the board, and on top sigma_zz = normal exp(i q x) and
-    sigma_xz = shear i exp(i q x).
+    The board holds the layer; on top sigma_zz = normal exp(i q x) and sigma_xz = shear i exp(i q x).
     """
     # Longer waves differ from their limit by less than the equations of nearly equal exponentials leave.
     q = np.maximum(q_per_mm.ravel(), 1e-5 / layer.thickness_mm)
@@ -171,8 +164,8 @@ def _waves(layer: Layer, q: Array, z_mm: float) -> _Waves:
     return _Waves(u, w, q[:, None] * slope_u, q[:, None] * slope_w)
 
 
+# Indices of boxes into maps (presses, size, size): presses (n, 1, 1), rows (n, height, 1), columns (n, 1, width).
 Place = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
-"""Indices of boxes into maps (presses, size, size): presses (n, 1, 1), rows (n, height, 1), columns (n, 1, width)."""
 
 
 class PadGrid:
