@@ -56,17 +56,16 @@ class FemMethod(NamedTuple):
 
 
 def fig7(bench: Workbench, report: Report) -> None:
-    """Compare the methods with finite elements, which take half an hour on one core."""
+    """Compare the methods with finite elements, which take an hour on one core."""
     surfaces, meshes, steps = (LETTERS[:2], (Mesh(4, 2), Mesh(3, 2)), 2) if bench.quick else (LETTERS, MESHES, 10)
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
     by_fem: dict[str, FemMethod] = {}
-    forces_n = np.empty(0, dtype=np.float32)
+    forces_n = np.empty(0)
     for mesh in reversed(meshes):
         names = tracked(surfaces, f"FEM {mesh}", "surface")
-        verdicts = [press_surface(name, mesh, indentation_mm) for name in names]
-        maps = np.stack([verdict.patterns_mm for verdict in verdicts])
-        by_fem[f"FEM {mesh}"] = FemMethod(maps, float(np.mean([verdict.run_s.sum() for verdict in verdicts])))
-        forces_n = np.stack([verdict.force_n for verdict in verdicts])
+        presses = [press_surface(name, mesh, indentation_mm) for name in names]
+        maps, forces_n, run_s = (np.stack(parts) for parts in zip(*presses, strict=True))
+        by_fem[f"FEM {mesh}"] = FemMethod(maps, float(run_s.mean()))
     truth = by_fem[f"FEM {meshes[0]}"].maps
     methods, beta_mm = _methods(surfaces, indentation_mm, forces_n, truth)
     methods |= by_fem
