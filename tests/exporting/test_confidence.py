@@ -70,7 +70,7 @@ class Oracle:
 
 def test_the_table_finds_error_and_gain_by_doubt():
     frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-    table = fit_confidence(Oracle(frozen), [frozen])
+    table = fit_confidence(Oracle(frozen), frozen)
     assert set(table) == {"1", "2"} and len(table["1"]["doubt"]) == BINS and table["2"]["gain"] == []
     assert is_confidence(table, 2)
     for about, error, gain in zip(*table["1"].values(), strict=True):
