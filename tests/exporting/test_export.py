@@ -105,6 +105,7 @@ def test_intervals_hold_on_the_presses_that_set_them(folder, name, tmp_path):
         assert_intervals_hold(session, given)
     levels = session.contract.interval_levels
     assert list(levels) == ["50", "80", "90", "95"]
+    assert levels["90"] == pytest.approx([float(half_width_mm(1.0))] * 4, rel=0.02)
     assert all(low <= high for low, high in zip(levels["50"], levels["95"], strict=True))
 
 
