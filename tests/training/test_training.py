@@ -84,20 +84,15 @@ class Hostile:
         return (print, ("it ran",))
 
 
-@pytest.mark.parametrize("damage", ["no weights", "no report", "other size", "hostile", "garbage"])
+@pytest.mark.parametrize("damage", ["no report", "other size", "hostile", "garbage"])
 def test_what_is_no_checkpoint_is_refused_by_name(folder, tmp_path, damage, capsys):
-    weights, report = torch.load(folder / "small.pt", weights_only=True), (folder / "small.json").read_text()
-    path = tmp_path / "net.pt"
-    if damage != "no report":
-        path.with_suffix(".json").write_text(
-            report.replace('"channels": 16', '"channels": 32') if damage == "other size" else report
-        )
+    path, report = tmp_path / "net.pt", (folder / "small.json").read_text()
+    path.write_bytes(b"no weights at all" if damage == "garbage" else (folder / "small.pt").read_bytes())
     if damage == "hostile":
         torch.save({"weight": Hostile()}, path)
-    elif damage == "garbage":
-        path.write_bytes(b"no weights at all")
-    elif damage != "no weights":
-        torch.save(weights, path)
+    if damage != "no report":
+        report = report.replace('"channels": 16', '"channels": 32') if damage == "other size" else report
+        path.with_suffix(".json").write_text(report)
     with pytest.raises(CheckpointError, match=r"net\.pt is no checkpoint of train\.fit with net\.json"):
         load_network(path)
     assert "it ran" not in capsys.readouterr().out
@@ -179,13 +174,12 @@ RECIPE = Recipe(steps=12, batch=4, learning_rate=1e-2)
 
 
 class Map(PatternNet):
-    """The least network: a linear map with something random in training."""
+    """The least network: a linear map."""
 
     def __init__(self):
         super().__init__()
         self.taps, self.scale = 1, 1
         self.matrix = torch.nn.Linear(48, 16)
-        self.dropout = torch.nn.Dropout(0.0)
 
     def forward(self, window):
         return self.matrix(window.flatten(1)).view(-1, 4, 4)
@@ -213,6 +207,9 @@ def trained(tmp_path, recipe=RECIPE, **options):
 
 
 def test_the_rate_rises_for_a_tenth_and_falls_to_nothing():
+    for wrong in ({"steps": 0}, {"batch": 0}, {"learning_rate": -1.0}):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*, expected more than 0"):
+            replace(RECIPE, **wrong)
     shares = [learning_rate_share(progress) for progress in np.linspace(0, 1, 101)]
     assert shares[0] == pytest.approx(1 / 25) and max(shares) == pytest.approx(shares[10]) == pytest.approx(1)
     assert np.all(np.diff(shares[:11]) > 0) and np.all(np.diff(shares[10:]) < 0) and shares[-1] < 1e-4
@@ -245,12 +242,6 @@ def test_a_run_of_another_recipe_is_not_continued(tmp_path, steps, identity):
     trained(tmp_path, identity="these data", keep_every_s=-1.0)
     with pytest.raises(CheckpointError, match="delete it"):
         trained(tmp_path, replace(RECIPE, steps=steps), identity=identity)
-
-
-@pytest.mark.parametrize("wrong", [{"steps": 0}, {"batch": 0}, {"learning_rate": -1.0}])
-def test_recipes_that_cannot_be_are_refused_by_name(wrong):
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*, expected more than 0"):
-        replace(RECIPE, **wrong)
 
 
 def test_a_loss_that_is_no_number_ends_the_run_before_its_step(tmp_path):
