@@ -253,7 +253,7 @@ def maps(about, size=0.5):
     return pattern, about * pattern
 
 
-def test_between_doubts_the_error_is_interpolated_and_elsewhere_unknown():
+def test_the_error_is_interpolated_between_doubts():
     for about, share, another in ((0.05, 0.2, False), (0.139, 0.239, False), (0.2, 0.3, True), (0.6, 0.8, True)):
         rmse, worth_it = expect(TABLE, 1, *doubt(*maps(about)))
         assert rmse == pytest.approx(0.5 * share, rel=1e-4) and worth_it is another and WORTH_A_TAP == 0.02

@@ -56,7 +56,7 @@ class FemMethod(NamedTuple):
 
 
 def fig7(bench: Workbench, report: Report) -> None:
-    """Compare the methods with finite elements, which take an hour on one core."""
+    """Compare the methods with finite elements, which take half an hour on one core."""
     surfaces, meshes, steps = (LETTERS[:2], (Mesh(4, 2), Mesh(3, 2)), 2) if bench.quick else (LETTERS, MESHES, 10)
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
     by_fem: dict[str, FemMethod] = {}
@@ -130,6 +130,6 @@ def _how(surfaces: int, steps: int, beta_mm: float) -> str:
         f"all maps, by least squares against the truth it is compared with, and the best of {len(PSF_BETAS_MM)} betas "
         f"against FEM (beta {beta_mm:g} mm). Depth x force, as the paper has it: the touching pixels, sharp, with one "
         "factor fitted in the same way. layer: bonded layer without sides, Polonsky-Keer, Poisson's ratio "
-        f"{Layer().poisson:g}. FEM: Mooney-Rivlin, large strain, free sides, Poisson's ratio {LAYER.poisson:g}; nodes "
+        f"{Layer().poisson:g}. FEM: neo-Hookean, large strain, free sides, Poisson's ratio {LAYER.poisson:g}; nodes "
         "are the pixels. Run times are one process's."
     )
