@@ -229,10 +229,9 @@ class FrictionSolver:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Slide (n, 2) surfaces to the right and back, and turn them (n,) about the pad's centre from right to back.
 
-        They touch with pressures (n, size, size), where these are above 0, and have coefficients of friction mu (n,).
-        Returned are tractions on the pad to the right and back, (n, 2, size, size) in [MPa], and residuals (n,): the
-        RMS error over the contact of the movement, which should vanish where cells stick, and oppose the traction where
-        they slip, as a share of the surface's movement.
+        They touch with pressures (n, size, size) and have coefficients of friction mu (n,). Returned are tractions on
+        the pad to the right and back, (n, 2, size, size) in [MPa], and residuals (n,): the RMS over the contact of what
+        moves against Coulomb's law, as a share of the surface's movement.
         """
         count = len(pressure_mpa)
         along_mm = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm

@@ -149,11 +149,7 @@ class _Waves(NamedTuple):
 
 
 def _waves(layer: Layer, q: Array, z_mm: float) -> _Waves:
-    """Return the solutions (a + b q z) exp(+-q z) of Navier's equations, scaled to similar amplitudes.
-
-    For u = (a + b q z) exp(q z) equilibrium requires w = (a - b (3-4nu) + b q z) exp(q z); for u = (a + b q z) exp(-q
-    z), it requires w = (-a - b (3-4nu) - b q z) exp(-q z).
-    """
+    """Return the solutions (a + b q z) exp(+-q z) of Navier's equations, scaled to similar amplitudes."""
     kappa = 3 - 4 * layer.poisson
     above, below = q * (z_mm - layer.thickness_mm), q * z_mm
     rising, falling = np.exp(above), np.exp(-q * z_mm)
@@ -263,7 +259,7 @@ def side_movement(
 
 
 class SideGive:
-    """Compliance that free sides add on boxes of a grid: a few small matrix products in a step of the contact solver.
+    """Compliance that free sides add on boxes of a grid.
 
     A force at (x', y') adds across(x) across(x') along(y, y') to the displacement at (x, y), for each side and term.
     Profiles across are (n, terms, 2, width) and (n, terms, 2, height) at the boxes' columns and rows, lower side first,
