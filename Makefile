@@ -36,7 +36,7 @@ TURNED := data/turned7.npz
 FIGURES := data/named4.npz data/named7.npz data/nominal4.npz data/nominal7.npz
 
 models: $(VENV)/.dev $(PRESSES) $(TURNED) $(FIGURES) data/validation.npz  ## train the bundled models on, and export them again
-	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(PRESSES) $(FIGURES) --validation data/validation.npz
+	$(BIN)/python -m train.fit checkpoints --data $(PRESSES) $(FIGURES) --validation data/validation.npz
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --validation data/validation.npz --intervals $(PRESSES) $(TURNED) --trust edge/models/stsr-int8.onnx
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --validation data/validation.npz --intervals $(PRESSES) $(TURNED) --trust edge/models/stsr-int8.onnx --int8 $(PRESSES)
 	$(BIN)/python -m train.freeze edge/models --data $(PRESSES)

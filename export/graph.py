@@ -1,8 +1,7 @@
 """Networks to ONNX graphs of any number of windows, in float32, without traces of the machine.
 
-A graph has the weights under the network's own names, and next to its contract the name of the network, so that
-train.learning.checkpoint can restore it. Networks whose batch normalisation was folded into the weights, those of the
-paper, need their checkpoint.
+A graph has the weights under the network's own names, so that train.learning.checkpoint can restore it. Networks whose
+batch normalisation was folded into the weights, those of the paper, need their checkpoint.
 """
 
 import logging
@@ -37,16 +36,12 @@ class ParityError(ExportError, ArithmeticError):
     """Failed comparison: the ONNX graph does not compute what the network computes."""
 
 
-_ARGUMENTS: Final = {INPUT_NAME: "window", POSES_NAME: "poses", PAD_NAME: "pad"}
-"""Argument of a network's forward for each input of its graph."""
+_ARGUMENTS: Final = {INPUT_NAME: "window", POSES_NAME: "poses", PAD_NAME: "pad"}  # of a network's forward, by input
 _TRACED: Final = 2  # windows, or earlier taps, with which a graph is traced: the tracer takes the size 1 as fixed
 
 
 def to_model(net: PatternNet, pad: SensorGeometry = USPA44) -> onnx.ModelProto:
-    """Return the network as a checked ONNX graph of any number of windows a run, without a contract.
-
-    The exporter folds batch normalisation into the convolutions before it. ExportError if torch returns none.
-    """
+    """Return the network as a checked ONNX graph of any number of windows a run, without a contract."""
     example = torch.zeros(_TRACED, 3 * net.taps, pad.rows, pad.cols)
     free = {0: torch.export.Dim(ANY_BATCH)}
     inputs, dims = {INPUT_NAME: example}, {INPUT_NAME: free}
@@ -89,10 +84,7 @@ def to_model(net: PatternNet, pad: SensorGeometry = USPA44) -> onnx.ModelProto:
 def outputs(
     net: PatternNet, windows: Tensor, pads: Tensor | None = None, poses: Tensor | None = None
 ) -> tuple[Tensor, ...]:
-    """Return the patterns, and deviations and tractions if any, of windows (n, 3K, rows, cols) in network units.
-
-    Without `pads` all constants are absent, without `poses` they are those of the paper's schedule.
-    """
+    """Return the patterns, and deviations and tractions if any, of windows (n, 3K, rows, cols) in network units."""
     stated = {"pad": pads, "poses": poses}
     with torch.inference_mode():
         given = net(windows, **{name: values for name, values in stated.items() if values is not None})

@@ -6,8 +6,7 @@ the trunk's, and what reads it before the outputs. Those on smaller grids, which
 take a tenth of the time, and no later layer recovers their losses. A network that takes poses also quantises what
 encodes its earlier taps, a third of its time with four taps. Its layers that read logarithms stay in float, for a step
 of their range is a factor; so do those that compare taps: in int8 they made a pattern 2.9 times its largest value too
-large on windows beyond any touch. The training taps are those that `export.to_onnx --int8` is given: in the Makefile,
-PRESSES.
+large on windows beyond any touch.
 """
 
 import contextlib
@@ -21,13 +20,11 @@ from typing import Any, Final
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
 from edge.inference.contract import INPUT_NAME, PAD_NAME, POSES_NAME, Contract
-from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.graph import ExportError
 from firmware_bridge.pad_geometry import AXES
 from train.data.press_batches import Batch
@@ -36,17 +33,13 @@ from train.learning.checkpoint import batches_of
 from train.learning.training_loop import Recipe
 
 _FEWEST: Final = 32
+# Beginnings of the names of the weights whose convolutions are quantised; the paper's networks have others.
 LAYERS: Final = ("trunk.", "leave.0.", "uncertainty.0.", "encode.", "send.", "ask.", "hear.")
-"""Beginnings of the names of the weights whose convolutions are quantised; the paper's networks have others."""
-PASSING_ON: Final = {"Relu": any, "Add": any, "Concat": all}
-"""Operations that are quantised if any or all of their inputs are."""
+PASSING_ON: Final = {"Relu": any, "Add": any, "Concat": all}  # operations quantised if any or all of their inputs are
 
 
 def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
-    """Draw windows with their pad inputs from training taps as in training, light contacts included.
-
-    ExportError if there are too few sequences.
-    """
+    """Draw windows with their pad inputs from training taps as in training, light contacts included."""
     if len(taps) < _FEWEST:
         raise ExportError(f"{len(taps)} sequences to take ranges of, expected {_FEWEST} or more")
     given = (1 / contract.taps,) * contract.taps
@@ -70,10 +63,7 @@ class _Inputs(CalibrationDataReader):
 
 
 def quantised(model: onnx.ModelProto, seen: Batch) -> onnx.ModelProto:
-    """Return a float graph with quantise and dequantise nodes around all nodes that may be quantised.
-
-    Ranges are measured on the batch `seen`, light contacts included. ExportError if no node may be quantised.
-    """
+    """Return a float graph with quantise and dequantise nodes, whose ranges are measured on the batch `seen`."""
     nodes = integer_nodes(model)
     if not nodes:
         raise ExportError("no convolution of the graph may be quantised: export it without --int8")
@@ -108,19 +98,6 @@ def _inputs(model: onnx.ModelProto, seen: Batch) -> dict[str, NDArray[np.float32
     if PAD_NAME in names and seen.pad is not None:
         inputs[PAD_NAME] = seen.pad.numpy()
     return inputs
-
-
-def convolutions(model: onnx.ModelProto) -> tuple[int, int]:
-    """Return how many convolutions onnxruntime runs in int8 after optimising a graph, and their total number."""
-    with tempfile.TemporaryDirectory() as drafts:
-        path = Path(drafts) / "optimised.onnx"
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = LOG_FATAL_ONLY
-        options.optimized_model_filepath = str(path)
-        onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-        optimised = onnx.load(path)
-    kinds = [node.op_type for node in optimised.graph.node if "Conv" in node.op_type]
-    return kinds.count("QLinearConv"), len(kinds)
 
 
 @contextlib.contextmanager

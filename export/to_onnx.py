@@ -4,15 +4,14 @@ python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --
 python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --intervals data/gripped.npz
 python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --int8 data/gripped.npz
 
-A graph takes any number of windows in one run. Deviations are corrected by region on validation presses, so that their
-intervals hold; with --intervals, by window.
+Deviations are corrected by region on validation presses, so that their intervals hold; with --intervals, by window.
 """
 
 import argparse
 import sys
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -31,12 +30,12 @@ from edge.inference.trust_model import Trust
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from export.graph import outputs, to_model
-from export.int8 import calibration_batch, convolutions, quantised
+from export.int8 import calibration_batch, quantised
 from export.parity import GraphRun, check_parity, run_network
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import pad_of
 from train.data.frozen_presses import freeze_presses
-from train.data.press_batches import COUNTS_PER_UNIT
+from train.data.press_batches import COUNTS_PER_UNIT, OneSensor
 from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import CheckpointError, ended_by_errors
 from train.learning.checkpoint import load_network, origin, sensor_of
@@ -54,10 +53,7 @@ MOST_COVERAGE_CHANGE: Final = 0.02  # largest accepted change of the 90 % interv
 
 
 def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> Contract:
-    """Return the contract of a network's graph for the pad of the test set, with its error still empty.
-
-    CheckpointError if the report of the weights lacks a key.
-    """
+    """Return the contract of a network's graph for the pad of the test set, with its error still empty."""
     pad = pad_of(*frozen.newest.shape[-2:])
     example = torch.zeros(1, 3 * net.taps, pad.rows, pad.cols)
     given = outputs(net, example)
@@ -95,46 +91,36 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> C
     )
 
 
-@dataclass(frozen=True, slots=True)
-class IntervalData:
-    """Presses that make intervals; without those of training, corrections are by region and number of taps alone."""
-
-    validation: PressSet
-    training: PressSet | None = None
-    steps: int = 2000  # of the fit
-
-
 def export(
     checkpoint: Path,
     folder: Path,
     frozen: FrozenSet,
     *,
+    validation: PressSet | None = None,
+    intervals: PressSet | None = None,
     calibration: PressSet | None = None,
-    validation: Sequence[FrozenSet] = (),
     trust: Trust | None = None,
-    intervals: IntervalData | None = None,
+    steps: int = 2000,
 ) -> tuple[str, str]:
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx; return a line that describes it, and the limits it exceeds.
 
-    One that exceeds a limit replaces no file.
-    Parity is checked in float32, also for graphs that are then quantised; errors are those in the runtime's session.
-    The model is for the pad of the test set `frozen`. Ranges of int8 are measured on the training taps `calibration`,
-    and confidence is fitted on `validation`. What is None or empty is left out; without `intervals` the deviations stay
-    as the checkpoint has them.
+    One that exceeds a limit replaces no file. The model is for the pad of the test set `frozen`, which its errors are
+    of. Intervals and confidence are set by `validation`; on the training presses `intervals`, if any, the correction of
+    intervals is fitted, in so many steps. The ranges of int8 are measured on the training taps `calibration`.
     """
     net, report = load_network(checkpoint)
     write_out(net)
-    contract = contract_of(net, report, frozen)
+    contract, sensor = contract_of(net, report, frozen), sensor_of(report)
     pad, readings = pad_of(contract.rows, contract.cols), list[Readings]()
-    if intervals is not None and isinstance(net, CompactNet):
-        if (intervals.validation.scale, *intervals.validation.counts.shape[3:]) != (net.scale, pad.rows, pad.cols):
+    if validation is not None and isinstance(net, CompactNet):
+        if (validation.scale, *validation.counts.shape[3:]) != (net.scale, pad.rows, pad.cols):
             raise CheckpointError(f"{checkpoint} is at x{net.scale} of a {pad.name}, the validation presses are not")
         report = {**report, "options": {**report["options"], "intervals": True}}
-        if intervals.training is None:
+        if intervals is None:
             net.add_intervals().contact_level.fill_(contract.contact_level)
         else:
-            fit_correction(net, intervals.training, contract.contact_level, steps=intervals.steps)
-        readings = readings_of_presses(intervals.validation, net.taps, sensor=sensor_of(report))
+            fit_correction(net, intervals, contract.contact_level, steps=steps)
+        readings = readings_of_presses(validation, net.taps, sensor=sensor)
         levels = conform(net, lambda *given: run_network(net, *given), readings)
         contract = replace(contract, interval_levels=levels)
     name, model = checkpoint.stem, to_model(net, pad)
@@ -146,15 +132,15 @@ def export(
         if readings and isinstance(net, CompactNet):
             contract = replace(contract, interval_levels=conform(net, GraphRun(model), readings))
             model = quantised(to_model(net, pad), seen)
-        integer, convs = convolutions(model)
-        facts = [f"{integer} of {convs} convolutions in int8"]
         if contract.scale == frozen.scale:
             float_error = mean_error(judge_model(_session(in_float, contract), frozen))
         contract = replace(contract, arithmetic="int8")
 
     session = _session(model, contract)
-    facts = [*judge_in_contract(session, frozen, validation), *facts]
+    facts = [*judge_in_contract(session, frozen), *facts]
     contract = session.contract
+    if validation is not None and readings:
+        contract.confidence.update(fit_confidence(session, _as_test_set(validation, sensor)))
     lost, exceeded = cost(float_error, contract.test_error.get(str(contract.taps), {}))
     # The paper's networks, several of whose taps would be believed whatever they are, have neither.
     if trust is not None and contract.pad_inputs and contract.traction_scale:
@@ -168,6 +154,10 @@ def export(
         write_in_place(path, lambda draft: draft.write_bytes(content), load_session)
     line = f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*facts, *lost])}"
     return line, exceeded and f"{name}.onnx ({exceeded})"
+
+
+def _as_test_set(presses: PressSet, sensor: OneSensor | None) -> FrozenSet:
+    return freeze_presses(presses, SEED, Nuisances() if sensor is None else sensor.nuisances).as_frozen_set()
 
 
 def _session(model: onnx.ModelProto, contract: Contract) -> ModelSession:
@@ -199,11 +189,8 @@ def cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> tup
 BINS: Final = 10
 
 
-def judge_in_contract(session: ModelSession, frozen: FrozenSet, validation: Collection[FrozenSet]) -> list[str]:
-    """Put errors on the test set and confidence into a model's contract, and return the errors as text.
-
-    A model of another scale than the frozen set's is not evaluated.
-    """
+def judge_in_contract(session: ModelSession, frozen: FrozenSet) -> list[str]:
+    """Put errors on the test set into the contract of a model of its scale, and return them as text."""
     contract = session.contract
     parts = [f"x{contract.scale}"]
     if contract.scale == frozen.scale:
@@ -215,32 +202,22 @@ def judge_in_contract(session: ModelSession, frozen: FrozenSet, validation: Coll
             parts.append(f"interval covers {error['coverage_90']:.1%}")
     else:
         parts.append(f"not evaluated, the test set is of x{frozen.scale}")
-    fitting = [frozen_set for frozen_set in validation if frozen_set.scale == contract.scale]
-    if fitting and session.deviation is not None:
-        contract.confidence.update(fit_confidence(session, fitting))
     return parts
 
 
-def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[str, list[float]]]:
+def fit_confidence(model: Model, frozen: FrozenSet) -> dict[str, dict[str, list[float]]]:
     """Fit the table of edge.inference.intervals for a model with deviations.
 
     Frames are sorted by their uncertainty into bins of equally many; a bin's gain is that of its frames together.
     """
     taps = model.contract.taps
-    parts = [
-        [doubts_and_errors(model, given, frozen) for given in range(1, taps + 1)]
-        for frozen in tracked(sets, "confidence", "set")
-    ]
-    by_taps = [np.concatenate([part[given] for part in parts], axis=1) for given in range(taps)]
+    by_taps = [doubts_and_errors(model, given, frozen) for given in tracked(range(1, taps + 1), "confidence", "run")]
     rows = {str(given): _row(by_taps[given - 1 : given + 1]) for given in range(1, taps + 1)}
     return {given: row for given, row in rows.items() if row["doubt"]}  # empty if no pattern exceeds zero
 
 
 def doubts_and_errors(model: Model, given: int, frozen: FrozenSet) -> NDArray[np.float64]:
-    """Return uncertainty, RMS error and RMS of the pattern for every frame, (3, n), with the newest `given` taps.
-
-    ValueError if the model gives no deviation.
-    """
+    """Return uncertainty, RMS error and RMS of the pattern for every frame, (3, n), with the newest `given` taps."""
     rows, contract = [], model.contract
     for window, truth in zip(windows_of(frozen, contract, given), frozen.patterns(), strict=True):
         pattern, deviation = model.run(contract.scale_window(window)), model.deviation
@@ -293,28 +270,21 @@ def main(arguments: list[str] | None = None) -> None:
     lossy: list[str] = []
     with ended_by_errors("export"):
         options.out.mkdir(parents=True, exist_ok=True)
-        sensor, *others = (sensor_of(load_network(path)[1]) for path in options.checkpoints)
-        if any(other != sensor for other in others):  # whose gains the validation presses are read with
-            raise CheckpointError("these checkpoints are not all of the same sensor: export each by itself")
-        nuisances = Nuisances() if sensor is None else sensor.nuisances
-        frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-        if options.test is not None:
-            frozen = freeze_presses(load_presses(options.test), SEED, nuisances).as_frozen_set()
-        presses = load_presses(options.validation)
+        sensors = [sensor_of(load_network(path)[1]) for path in options.checkpoints]
+        frozen, presses = load_frozen_set(BUNDLE_DIR / "frozen.npz"), load_presses(options.validation)
+        test = None if options.test is None else load_presses(options.test)
         training = None if options.intervals is None else join_presses([*map(load_presses, options.intervals)])
         taps = None if options.int8 is None else join_presses([*map(load_presses, options.int8)])
         trust = None if options.trust is None else load_trust(options.trust, presses)
-        validation = [freeze_presses(presses, SEED, nuisances).as_frozen_set()]
-        intervals = IntervalData(presses, training)
-        for checkpoint in tracked(options.checkpoints, "exporting", "model"):
+        for checkpoint, sensor in tracked([*zip(options.checkpoints, sensors, strict=True)], "exporting", "model"):
             line, exceeded = export(
                 checkpoint,
                 options.out,
-                frozen,
+                frozen if test is None else _as_test_set(test, sensor),
+                validation=presses,
+                intervals=training,
                 calibration=taps,
-                validation=validation,
                 trust=trust,
-                intervals=intervals,
             )
             sys.stdout.write(line + "\n")
             lossy += [exceeded] * bool(exceeded)

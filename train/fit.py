@@ -2,8 +2,6 @@
 
     python -m train.fit checkpoints --data data/gripped.npz data/taps7.npz --validation data/validation.npz
 
-With `torchrun --nproc-per-node 2 -m train.fit` two processes share each batch.
-
 The bundled networks are trained for as many steps, that of one tap and that of several taps, so that taps alone tell
 them apart. An interrupted run resumes with the same command. NAME.json, next to the weights, has the loss by steps.
 """
@@ -18,7 +16,7 @@ from train.data.frozen_presses import freeze_presses
 from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import DatasetError, ended_by_errors
 from train.learning.checkpoint import Training, fit_network
-from train.learning.training_loop import Recipe, leave_group, rank_and_world
+from train.learning.training_loop import Recipe
 from train.networks.named_networks import NETWORKS
 from train.physics.pad_draws import KNOWN
 from train.surfaces.poses import MAX_TAPS
@@ -67,9 +65,8 @@ def _line(report: dict[str, Any]) -> str:
 
 
 def _say(line: str) -> None:
-    if rank_and_world()[0] == 0:
-        sys.stdout.write(line + "\n")
-        sys.stdout.flush()
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -82,7 +79,6 @@ def main(arguments: list[str] | None = None) -> None:
         for training in bundled(data) if options.network is None else (_training(options),):
             _say(_line(fit_network(training, data, frozen, options.folder)))
     _say(f"all in {(time.monotonic() - started_s) / 60:.1f} min")
-    leave_group()
 
 
 def _training(options: argparse.Namespace) -> Training:

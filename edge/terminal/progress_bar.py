@@ -32,7 +32,6 @@ def progress(what: str, total: float, unit: str, *, done: float = 0, stream: Tex
     from tqdm import tqdm  # here and not above, since few programs need it
 
     stream = sys.stderr if stream is None else stream
-    first = os.environ.get("RANK", "0") == "0"  # of torchrun's processes, which share a terminal
     return tqdm(
         desc=harmless(what, kept=""),
         total=total,
@@ -42,7 +41,7 @@ def progress(what: str, total: float, unit: str, *, done: float = 0, stream: Tex
         file=None if stream is None else drawn(stream),
         leave=False,
         dynamic_ncols=True,
-        disable=not (first and stream is not None and not stream.closed and stream.isatty()),
+        disable=not (stream is not None and not stream.closed and stream.isatty()),
         delay=DELAY_S,
     )
 

@@ -39,12 +39,10 @@ PAGES = (
 """Pages whose commands must work; the others name commands and options as they were."""
 _FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 _INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
-_OURS = re.compile(r"(?:edge-sr|make|pip install|python|torchrun|mkdocs) \S")
+_OURS = re.compile(r"(?:edge-sr|make|pip install|python|mkdocs) \S")
 NAMED = re.compile(r"edge-sr ([a-z]+)")
 """A command that is spoken of, not one to be typed."""
-_MAKEFILE = re.compile(
-    r"^\t(?:\w+=\S+ )*\$\(BIN\)/((?:python -m (?!pip|pytest)|edge-sr|torchrun|mkdocs).*)$", re.MULTILINE
-)
+_MAKEFILE = re.compile(r"^\t(?:\w+=\S+ )*\$\(BIN\)/((?:python -m (?!pip|pytest)|edge-sr|mkdocs).*)$", re.MULTILINE)
 
 
 def inline(page: Path) -> list[str]:
@@ -79,7 +77,6 @@ PARSED = {
     r"edge-sr (replay \S+ )?--sink rerun:view": "opens a viewer; test_rerun sends to the package's interface",
     r"edge-sr map .*": "is of poses that a robot sends, and without them writes nothing; test_poses_stdin runs it",
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
-    r"torchrun .*": "trains",
     r"python tests/system/chaos\.py .*": "takes minutes; test_chaos runs it, shortened",
     r"python tests/support/tapping_robot\.py .*": "taps for a minute; test_own_taps runs it by night",
     r"python tests/system/chaos_wire\.py .*": "plays until ended; test_chaos runs it",
@@ -128,8 +125,6 @@ def only_parsed(monkeypatch):
 
 def entry(words: list[str]):
     """Main function and arguments of a command of this repository."""
-    if words[0] == "torchrun":
-        words = ["python", *words[words.index("-m") :]]
     if words[0] == "edge-sr":
         return cli.main, words[1:]
     assert words[0] == "python", f"{words[0]}: who runs this?"
@@ -284,7 +279,7 @@ def test_options_that_are_spoken_of_exist():
         for path in (ROOT / package).rglob("*.py")
         for option in re.findall(r'"(--[a-z][a-z0-9-]*)[ "]', path.read_text())
     }
-    known |= {"--help", "--nproc-per-node"}  # argparse's, torchrun's
+    known |= {"--help"}
     for page in PAGES:
         for text in inline(page):
             for option in re.findall(r"(?<!\S)(--[a-z][a-z0-9-]*)", text):

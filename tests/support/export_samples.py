@@ -2,14 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import torch
 from press_samples import make_press_set
 
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import find_model
-from export.to_onnx import IntervalData, export
+from export.to_onnx import export
 from train.data.frozen_presses import freeze_presses
 from train.learning.checkpoint import Training, fit_network, load_network
 from train.learning.training_loop import Recipe
@@ -20,7 +20,7 @@ from train.trust import load_trust
 OPTIONS: Final = {"channels": 16, "blocks": 1, "known": KNOWN}
 PRESSES: Final = make_press_set(count=64, taps=2)
 SURE: Final = Training("sure", "fusion-mtsr2", Recipe(steps=2, batch=4, given=(0.5, 0.5)), options=OPTIONS)
-INTERVALS: Final = IntervalData(PRESSES, PRESSES, steps=50)
+INTERVALS: Final[dict[str, Any]] = {"validation": PRESSES, "intervals": PRESSES, "steps": 50}
 BEFORE: Final = b"the one before"
 """Content of sure.onnx before it is written."""
 
@@ -47,7 +47,7 @@ def small_models(folder: Path) -> None:
     torch.save(net.state_dict(), folder / "sure.pt")
     (folder / "sure.onnx").write_bytes(BEFORE)
     trust = load_trust(find_model("stsr-int8"))
-    export(folder / "sure.pt", folder, some_frames(), validation=[some_frames()], trust=trust, intervals=INTERVALS)
+    export(folder / "sure.pt", folder, some_frames(), trust=trust, **INTERVALS)
 
 
 def save_checkpoint(path: Path, net: PatternNet, name: str, **options: int) -> Path:

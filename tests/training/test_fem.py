@@ -1,12 +1,11 @@
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
 
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.fem_reference import FemPad, MooneyRivlin, NoEquilibriumError
+from train.physics.fem_reference import FemPad, NoEquilibriumError
 
 NOTHING_MM = 1e3
 
@@ -19,29 +18,19 @@ def bowl(along_mm, radius_mm):
     return (along_mm[:, None] ** 2 + along_mm[None, :] ** 2) / (2 * radius_mm)
 
 
-def test_the_rubber_is_the_layer_at_small_strain():
-    rubber = MooneyRivlin.of_layer(Layer(shear_modulus_mpa=0.12, poisson=0.49))
-    stiffness = torch.func.hessian(rubber.energy)(torch.eye(3, dtype=torch.float64))
-    assert [stiffness[0, 1, 0, 1], stiffness[0, 1, 1, 0]] == pytest.approx([0.12, 0.12])
-    assert stiffness[0, 0, 0, 0] == pytest.approx(4 / 3 * 0.12)
-    assert rubber.bulk_mpa / 0.12 == pytest.approx(49.67, abs=0.01)
-
-
 def test_a_plate_on_a_thin_slab_presses_by_closed_form():
     # Far from the rim a bonded slab only gets thinner: F = diag(1, 1, s), whose stress is d psi / ds.
     layer = Layer(thickness_mm=1.0, poisson=0.3)
-    rubber = MooneyRivlin.of_layer(layer)
     pad = FemPad(2, 2, layer)
     steps_mm = np.array([0.001, 0.1, 0.25])
-    presses = pad.press(np.zeros((pad.size, pad.size)), steps_mm)
+    pushes_n, _ = pad.press(np.zeros((pad.size, pad.size)), steps_mm)
     middle = pad.size // 2
 
     def stored(stretch):
-        first, second = 2 + stretch**2, 1 + 2 * stretch**2
-        shape = rubber.c1_mpa * first * stretch ** (-2 / 3) + rubber.c2_mpa * second * stretch ** (-4 / 3)
-        return shape + rubber.bulk_mpa / 2 * (stretch - 1) ** 2
+        shape = layer.shear_modulus_mpa / 2 * (2 + stretch**2) * stretch ** (-2 / 3)
+        return shape + pad.bulk_mpa / 2 * (stretch - 1) ** 2
 
-    for step_mm, push_n in zip(steps_mm, presses.push_n, strict=True):
+    for step_mm, push_n in zip(steps_mm, pushes_n, strict=True):
         stretch = 1 - step_mm
         expected_mpa = -(stored(stretch + 1e-5) - stored(stretch - 1e-5)) / 2e-5
         assert push_n[middle, middle] / pad.cell_mm**2 == pytest.approx(expected_mpa, rel=1e-3)
@@ -52,17 +41,17 @@ def test_at_small_strain_it_is_the_layer(thickness_mm, poisson):
     # The layer has no sides: 2 mm at 0.49 and 4.5 mm at 0.3 are the pads that do not feel theirs.
     layer, indentation_mm = Layer(thickness_mm, poisson=poisson), 0.06
     pad = FemPad(5, 3, layer)
-    presses = pad.press(bowl(pad.nodes_mm, 150.0), np.array([indentation_mm]))
+    push_n, down_mm = pad.press(bowl(pad.nodes_mm, 150.0), np.array([indentation_mm]))
     size, cell_mm = 84, 20 / 84
     cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
     solver = ContactSolver(layer, size, cell_mm)
     pressure_mpa, _ = solver.solve(bowl(cells_mm, 150.0)[None].astype(np.float32), indentation_mm, 1e-4)
     # Measured: force 0.4 % and 1.2 % off, surface 1.2 % and 2.9 % of the indentation.
-    assert presses.force_n[0] == pytest.approx(pressure_mpa.sum() * cell_mm**2, rel=0.02)
+    assert push_n.sum() == pytest.approx(pressure_mpa.sum() * cell_mm**2, rel=0.02)
     middle = pad.size // 2
     near = pad.nodes_mm[np.abs(pad.nodes_mm) < 7]
     surface = np.interp(near, cells_mm, solver.displacement_mm(pressure_mpa)[0, size // 2])
-    found = presses.displacement_mm[0, middle][np.abs(pad.nodes_mm) < 7]
+    found = down_mm[0, middle][np.abs(pad.nodes_mm) < 7]
     assert np.abs(found - surface).max() < 0.04 * indentation_mm
 
 

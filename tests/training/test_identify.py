@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bridge_samples import write_npz
@@ -52,7 +54,7 @@ def test_what_contacts_show_is_learned_or_else_the_prior_stays(mixture):
     log_gains = (log_gains - log_gains.mean(axis=1, keepdims=True)).ravel()
     constants = np.zeros(len(CONSTANTS))
     constants[2] = 0.5
-    found = learned(contacts(mixture, 100, np.exp(log_gains), constants, 3), mixture.model(widening=1.3))
+    found = learned(contacts(mixture, 100, np.exp(log_gains), constants, 3), replace(mixture.model(), widening=1.3))
     off, half = np.abs(np.log(found.gains) - log_gains), found.pad().gain_half_widths
     assert np.sqrt((off**2).mean()) < np.sqrt((log_gains**2).mean()) / 2 and (off <= half).mean() > 0.85
     assert found.constants[2] == pytest.approx(0.5, abs=0.15)

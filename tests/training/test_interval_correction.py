@@ -9,9 +9,7 @@ from press_samples import make_press_set
 
 from edge.inference.intervals import REGIONS, regions
 from train.learning.interval_fit import (
-    Readings,
     calibrate,
-    conform,
     fit_correction,
     half_width_mm,
     interval_coverage,
@@ -109,32 +107,6 @@ def test_factors_are_bounded_whatever_the_weights():
     for scale in (1e-6, 1.0, 1e6):
         factor = net(scale * windows())[1] / make_net()(scale * windows())[1]
         assert torch.isfinite(factor).all() and low * 0.999 < factor.min() and factor.max() < high * 1.001
-
-
-def test_conformal_intervals_hold_in_every_region():
-    """Errors are ten times as large at the edge, and twice as large of one tap."""
-    net = make_net()
-    correction = corrected(net)
-    readings = readings_of_presses(make_press_set(count=40), net.taps, times=1)
-    # Patterns are those of the presses, so that every region is there; the truth is apart by as much everywhere.
-    patterns = readings[0].truth
-    apart = [Readings(one.windows, one.pads, patterns + np.float32(0.01)) for one in readings]
-    region = regions(patterns, LEVEL, correction.near)
-    spread = np.random.default_rng(0).uniform(0.1, 1, patterns.shape) * np.where(region == 1, 0.1, 1)
-
-    def run(given, _pads, _poses):
-        later = torch.from_numpy(given[:, 3:].any(axis=(1, 2, 3))).float()[:, None]
-        factors = correction.log_factors(torch.zeros(len(given), len(correction.centre)), later).exp().numpy()
-        factor = np.take_along_axis(factors, region.reshape(len(given), -1).astype(int), axis=1)
-        return patterns, factor.reshape(patterns.shape) * spread * (1 + later[:, :, None].numpy())
-
-    levels = conform(net, run, apart)
-    assert list(levels) == ["50", "80", "90", "95"]
-    assert levels["90"] == pytest.approx([float(half_width_mm(1.0))] * 4, rel=0.02)
-    for given in (1, 2):
-        deviation = run(apart[0].with_taps(given), None, None)[1]
-        held = np.abs(patterns - apart[0].truth) <= half_width_mm(deviation)
-        assert [held[region == number].mean() for number in range(4)] == pytest.approx([0.9] * 4, abs=0.01)
 
 
 def test_a_fitted_correction_tells_windows_apart():

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -46,13 +46,10 @@ class Batch:
             poses=None if self.poses is None else torch.where(which[:, None, None], self.poses * _MIRRORED, self.poses),
         )
 
-    def share(self, rank: int, world: int, device: torch.device) -> "Batch":
-        """Return the part of one of several processes, on its device."""
-
-        def mine(part: Any) -> Any:
-            return None if part is None else part[rank::world].to(device)
-
-        return Batch(**{one.name: mine(getattr(self, one.name)) for one in fields(self)})
+    def to(self, device: torch.device) -> "Batch":
+        """Return the batch on a device."""
+        parts = {one.name: getattr(self, one.name) for one in fields(self)}
+        return replace(self, **{name: part.to(device) for name, part in parts.items() if part is not None})
 
 
 def network_input(window_counts: NDArray[np.float32]) -> Tensor:

@@ -42,10 +42,11 @@ def fig7(bench: Workbench, report: Report) -> None:
     """Compare the methods with finite elements, which take half an hour on one core."""
     surfaces, mesh, steps = (LETTERS[:2], Mesh(4, 2), 2) if bench.quick else (LETTERS, FINEST, 10)
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
-    pressed = [press_surface(name, mesh, indentation_mm) for name in tracked(surfaces, f"FEM {mesh}", "surface")]
-    truth = np.stack([one.patterns_mm for one in pressed])
-    methods, beta_mm = _methods(surfaces, indentation_mm, np.stack([one.force_n for one in pressed]), truth)
-    methods[f"FEM {mesh}"] = FemMethod(truth, float(np.mean([one.run_s.sum() for one in pressed])))
+    names = tracked(surfaces, f"FEM {mesh}", "surface")
+    presses = [press_surface(name, mesh, indentation_mm) for name in names]
+    truth, forces_n, run_s = (np.stack(parts) for parts in zip(*presses, strict=True))
+    methods, beta_mm = _methods(surfaces, indentation_mm, forces_n, truth)
+    methods[f"FEM {mesh}"] = FemMethod(truth, float(run_s.mean()))
 
     report.say(
         f"{len(surfaces)} letters at p5 r0, {steps} indentations up to {MAX_INDENTATION_MM} mm, all methods on the "
@@ -53,7 +54,7 @@ def fig7(bench: Workbench, report: Report) -> None:
         "fitted to the layer's surface, not to these maps. PSF (no plateau): times the indentation and one alpha for "
         f"all maps, by least squares against the truth it is compared with, and the best of {len(PSF_BETAS_MM)} betas "
         f"against FEM (beta {beta_mm:g} mm). Depth x force, as the paper has it: the touching pixels, sharp, with one "
-        "factor fitted in the same way. FEM: Mooney-Rivlin, large strain, free sides, Poisson's ratio "
+        "factor fitted in the same way. FEM: neo-Hookean, large strain, free sides, Poisson's ratio "
         f"{LAYER.poisson:g}; nodes are the pixels. Run times are one process's."
     )
     rows: list[Row] = []

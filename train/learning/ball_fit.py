@@ -26,8 +26,8 @@ TAXELS: Final = USPA44.taxel_count
 CHANNELS: Final = len(AXES) * TAXELS
 _OF_PAD: Final = len(RANGES) + 2  # its constants, the cross-talk, and the logarithm of the ball's radius
 _GAIN_SPREAD: Final = 0.086  # of chips, seats and moments together, one standard deviation
+# Deviations of a press about its first guess: x and y in [mm], log of depth, drag in [mm], log of friction.
 _MOVES: Final = (1.5, 1.5, 0.5, 0.15, 0.15, 0.5)
-"""Deviations of a press about its first guess: x and y in [mm], log of depth, drag in [mm], log of friction."""
 _BALL_ERROR: Final = 0.05  # of the stated diameter, as a share of it, one standard deviation
 _CROSS_TALK: Final = Nuisances().cross_talk
 _FACTOR: Final = 0.03  # standard deviation of what the pad's lag makes of a press
@@ -47,12 +47,7 @@ _Array = NDArray[np.float64]
 class _Presses:
     """Presses of a ball, as a function of what is unknown of them and of the pad, each over its deviation."""
 
-    def __init__(
-        self,
-        presses: Sequence[NDArray[np.floating]],
-        diameter_mm: float,
-        known: SensorPad,
-    ) -> None:
+    def __init__(self, presses: Sequence[NDArray[np.floating]], diameter_mm: float, known: SensorPad) -> None:
         radius = np.log(diameter_mm / 2) + _BALL_ERROR * np.array([-LEVEL_90, LEVEL_90])
         ends = np.array([_known_ends(known, name) for name in RANGES] + [(0, _CROSS_TALK), radius])
         told = np.array([name in known.constants for name in RANGES] + [False, True])
@@ -147,11 +142,7 @@ class _Presses:
 
 
 def _light(presses: Sequence[NDArray[np.floating]], most_counts: float) -> _Array:
-    """Return two scans of each press, (n, CHANNELS).
-
-    They are the strongest below a sum of z, and one of about half of that. DatasetError if there are fewer than
-    LEAST_SCANS.
-    """
+    """Return two scans of each press, (n, CHANNELS): the strongest below a sum of z, and one of about half of that."""
     pairs = []
     for scans in presses:
         sums = scans[:, AXES.index("z")].sum(axis=(1, 2))
@@ -178,13 +169,9 @@ def _known_ends(known: SensorPad, name: str) -> tuple[float, float]:
 def fit_ball(presses: Sequence[NDArray[np.floating]], diameter_mm: float, known: SensorPad) -> SensorPad:
     """Return those constants of a pad that presses of a ball determine, with 90 % intervals; not counts per newton.
 
-    Args:
-        presses: scans (n, 3, rows, cols) of each from first touch on, in counts over the pad that was free just before.
-        diameter_mm: of the ball, in [mm].
-        known: of the sensor; a constant without an interval is as good as certain.
-
-    Raises:
-        DatasetError: they are too few, or no pad that is simulated reads so.
+    Each press is scans (n, 3, rows, cols) from first touch on, in counts over the pad that was free just before.
+    A constant that is known without an interval is as good as certain. DatasetError if they are too few, or no pad that
+    is simulated reads so.
     """
     fit = _Presses(presses, diameter_mm, known)
     count = _OF_PAD + CHANNELS + len(fit.counts) * _OF_PRESS

@@ -5,7 +5,6 @@ A float32 ONNX graph is read like a checkpoint: it holds its network's weights, 
 
 import hashlib
 import json
-import platform
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -25,16 +24,7 @@ from train.data.press_batches import Batch, OneSensor, PosedBatches, PressBatche
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
 from train.learning.interval_fit import calibrate, interval_coverage
-from train.learning.training_loop import (
-    DAMAGES,
-    Recipe,
-    device_of_rank,
-    rank_and_world,
-    reason,
-    train,
-    wait_for_all,
-    write_state,
-)
+from train.learning.training_loop import DAMAGES, Recipe, best_device, reason, train, write_state
 from train.networks.blocks import Objective, PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.named_networks import build, grown
@@ -67,10 +57,9 @@ class Training:
 def fit_network(
     training: Training, data: PressSet, validation: FrozenSet, folder: Path, taps: PressSet | None = None
 ) -> dict[str, Any]:
-    """Train, calibrate, evaluate and write one network, and return the content of its NAME.json.
+    """Train, calibrate, evaluate and write one network, unless that is done, and return the content of its NAME.json.
 
     `taps` of the one sensor that it is for are mixed in.
-    A checkpoint of the same training that already exists is left as it is.
     """
     folder.mkdir(parents=True, exist_ok=True)
     data_sha256, path = data.sha256(), folder / f"{training.name}.pt"
@@ -91,8 +80,6 @@ def fit_network(
         if start_path is None
         else grown(load_network(start_path)[0], training.network, training.scale, **training.options)
     )
-    rank, world = rank_and_world()
-    device = device_of_rank(rank)
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
     recipe = training.recipe
     batches = batches_of(data, training.scale, recipe, seed, posed=net.takes_poses, sensor=training.sensor)
@@ -101,7 +88,7 @@ def fit_network(
     _check_validation(validation, data, net.taps)
     elapsed_s, course = train(
         net,
-        _objective(net, device, seed),
+        _objective(net, seed),
         batches,
         recipe,
         (resume_path := folder / f"{training.name}.resume"),
@@ -119,19 +106,14 @@ def fit_network(
         **made_of,
         "steps": recipe.steps,
         "elapsed_s": round(elapsed_s, 1),
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.machine()} processor",
-        "processes": world,
-        "threads": torch.get_num_threads(),
         **_evaluated(net, validation),
         "course": course,
     }
-    if rank == 0:
-        # The report is written last, so that it never describes weights that do not exist.
-        text = json.dumps(report, indent=1) + "\n"
-        write_state(path, net.state_dict())
-        write_in_place(path.with_suffix(".json"), lambda draft: draft.write_text(text), lambda draft: draft.read_text())
-        resume_path.unlink(missing_ok=True)
-    wait_for_all()
+    # The report is written last, so that it never describes weights that do not exist.
+    text = json.dumps(report, indent=1) + "\n"
+    write_state(path, net.state_dict())
+    write_in_place(path.with_suffix(".json"), lambda draft: draft.write_text(text), lambda draft: draft.read_text())
+    resume_path.unlink(missing_ok=True)
     return report
 
 
@@ -150,10 +132,7 @@ def _check_validation(validation: FrozenSet, data: PressSet, taps: int) -> None:
 def batches_of(
     data: PressSet, scale: int, recipe: Recipe, seed: int, *, posed: bool = False, sensor: OneSensor | None = None
 ) -> Callable[[int], Batch]:
-    """Return batches for a recipe, whose taps were only turned unless they are posed.
-
-    DatasetError if no sequence has as many taps, or the presses have another scale.
-    """
+    """Return batches for a recipe, of taps that were only turned unless they are posed; DatasetError without any."""
     if scale != data.scale:
         raise DatasetError(
             f"patterns at x{scale} asked for, these presses have them at x{data.scale}: make others at that scale"
@@ -169,9 +148,9 @@ def _path_of(start: str, folder: Path) -> Path:
 
 
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
-    """Load the network of NAME.pt in evaluation mode, with its report from NAME.json, or of a float32 NAME.onnx.
+    """Load the network of NAME.pt and its report NAME.json, or that of a float32 NAME.onnx, or raise CheckpointError.
 
-    CheckpointError if a file is missing, or the weights do not fit.
+    The network is in evaluation mode.
     """
     try:
         if path.suffix == _GRAPH:
@@ -244,10 +223,10 @@ def _file_sha256(path: Path) -> str:
         raise CheckpointError(f"{path}, to start from: {error.strerror or error}; train it first") from error
 
 
-def _objective(net: PatternNet, device: torch.device, seed: int) -> Objective:
+def _objective(net: PatternNet, seed: int) -> Objective:
     if isinstance(net, CompactNet):
         return HeteroscedasticError()
-    return SrganObjective(device, seed=seed) if isinstance(net, TactileSRGAN) else RelativeError()
+    return SrganObjective(best_device(), seed=seed) if isinstance(net, TactileSRGAN) else RelativeError()
 
 
 def _evaluated(net: PatternNet, validation: FrozenSet) -> dict[str, float]:

@@ -32,15 +32,16 @@ from train.physics.pad_draws import known_numbers
 from train.physics.sensor_noise import Nuisances
 
 _FAR_MM: Final = (25.0, 80.0)
+# Largest count of a far magnet's field on the pad: from a tenth of a firm press to the end of the range of x and y.
 _FIELD_COUNTS: Final = (150.0, 1500.0)
-"""Largest count of a far magnet's field on the pad: from a tenth of a firm press to the end of the range of x and y."""
 Counts = NDArray[np.float32]
 Spoiling = Callable[[np.random.Generator, Counts], Counts]
 
 
 def magnet_field(rng: np.random.Generator, count: int) -> Counts:
     """Draw the counts (n, 3, rows, cols) that far dipoles above the pad add, with moments that point anywhere."""
-    towards, moment = (_unit(rng.standard_normal((count, 3))) for _ in range(2))
+    ways = rng.standard_normal((2, count, 3))
+    towards, moment = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
     towards[:, 2] = np.abs(towards[:, 2])
     place_mm = towards * rng.uniform(*_FAR_MM, count)[:, None]
     centres_mm = USPA44.taxel_centres_mm().reshape(USPA44.rows, USPA44.cols, 2)
@@ -52,10 +53,6 @@ def magnet_field(rng: np.random.Generator, count: int) -> Counts:
     field = ((3 * away * along - moment[:, None, None]) / length**3).transpose(0, 3, 1, 2)
     field /= np.abs(field).max(axis=(1, 2, 3), keepdims=True)
     return (field * rng.uniform(*_FIELD_COUNTS, count)[:, None, None, None]).astype(np.float32)
-
-
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _near_magnet(rng: np.random.Generator, counts: Counts) -> Counts:
@@ -187,8 +184,7 @@ def in_contact(counts: Counts) -> NDArray[np.bool_]:
     return (z.max(axis=(1, 2)) > LEAST_COUNTS) & (z.sum(axis=(1, 2)) >= OFF_COUNTS)
 
 
-def limited(network: SmallNetwork, features: NDArray[np.float32], false_alarms: float) -> FamiliarityCheck:
-    """Return the check whose limit a share of these right rows exceeds."""
+def _limited(network: SmallNetwork, features: NDArray[np.float32], false_alarms: float) -> FamiliarityCheck:
     scores = np.array(network(features))
     return FamiliarityCheck(network, float(np.quantile(scores, 1 - false_alarms, method="higher")))
 
@@ -197,13 +193,12 @@ def contact_check(network: SmallNetwork, presses: PressSet, false_alarms: float,
     """Return the check whose limit a share of these presses exceeds, read by sensors of several certainties."""
     readings, pads = drawn_readings(presses, seed)
     met = in_contact(readings)
-    return limited(network, features_of(readings[met], pads[met]), false_alarms)
+    return _limited(network, features_of(readings[met], pads[met]), false_alarms)
 
 
 _DEPTHS: Final = (0.85, 1.15)
-_OFF_MM: Final = (1.5, 6.0)
+_OFF_MM: Final = (1.5, 6.0)  # bounds of the error of a pose that is wrong, and of the way that a still pad did not go
 _OFF_DEG: Final = (10.0, 90.0)
-"""Bounds of the errors of a pose that is wrong, or a tap that is there although the pad did not move."""
 _FAR: Final = 3.0  # errors of a pose that is wrong, in stated deviations at least
 _USUAL: Final = (0.2, 1.0)
 
@@ -236,7 +231,7 @@ def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, see
         there = readings[:, earlier].any(axis=(1, 2, 3))
         pair, pose = readings[there][:, [0, earlier]], poses[there][:, earlier]
         rows.append(pair_features(pair, stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), _USUAL)))
-    return limited(network, np.concatenate(rows), false_alarms)
+    return _limited(network, np.concatenate(rows), false_alarms)
 
 
 def pair_features(pairs: Counts, poses: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -296,9 +291,9 @@ def fit_classifier(
     seed: int,
     weight_decay: float,
 ) -> SmallNetwork:
-    """Fit a network whose output is the log odds of a wrong row, right and wrong ones being equally frequent.
+    """Fit a network from rows (n, inputs) to the log odds of a wrong one, right and wrong ones being equally frequent.
 
-    Rows are (n, inputs); `widths` are units of the layers in between; the fewer the rows, the more `weight_decay`.
+    `widths` are units of the layers in between; the fewer the rows, the more `weight_decay`.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)

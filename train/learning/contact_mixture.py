@@ -36,8 +36,7 @@ from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import RANGES, Pad, draw_pad
 from train.physics.sensor_noise import Nuisances, apply_nuisances, neighbours
 
-CALIBRATION: Final = World(count=4800, per_pad=200, seed=9014)
-"""Sensors by which bias and intervals of learned gains are set."""
+CALIBRATION: Final = World(count=4800, per_pad=200, seed=9014)  # by which bias and intervals of learned gains are set
 TAXELS: Final = USPA44.taxel_count
 CHANNELS: Final = len(AXES) * TAXELS
 Z: Final = slice(AXES.index("z") * TAXELS, (AXES.index("z") + 1) * TAXELS)
@@ -46,11 +45,10 @@ CONSTANTS: Final = (
     "cross_talk",
 )
 """Constants that differ from pad to pad and change a contact's shape; each over half of its range."""
-_SCALES: Final = (
+_SCALES: Final = (  # name, middle and half range of each
     *((name, sum(RANGES[name]) / 2, (RANGES[name][1] - RANGES[name][0]) / 2) for name in CONSTANTS[:-1]),
     (CONSTANTS[-1], Nuisances().cross_talk / 2, Nuisances().cross_talk / 2),
 )
-"""Name, middle and half range of each."""
 _ROUNDS: Final = 12
 
 
@@ -62,20 +60,11 @@ class ContactMixture:
     means: NDArray[np.float64]  # (k, 1 + p, channels), of a middle pad, then the change by half a constant's range
     covariances: NDArray[np.float64]  # (k, channels, channels)
 
-    def model(
-        self, widening: float = 1.0, bias: NDArray[np.floating] | None = None, constant_widening: float = 1.0
-    ) -> ContactModel:
-        """Return the mixture as a running sensor learns by it."""
-        log_size = np.linalg.slogdet(self.covariances)[1]
-        return ContactModel(
-            np.log(self.share) - 0.5 * log_size,
-            self.means,
-            np.linalg.inv(self.covariances).astype(np.float32),
-            widening,
-            np.zeros(CHANNELS) if bias is None else np.asarray(bias, dtype=np.float64),
-            _SCALES,
-            constant_widening,
-        )
+    def model(self) -> ContactModel:
+        """Return the mixture as a running sensor learns by it, before it is calibrated."""
+        log_shares = np.log(self.share) - 0.5 * np.linalg.slogdet(self.covariances)[1]
+        precisions = np.linalg.inv(self.covariances).astype(np.float32)
+        return ContactModel(log_shares, self.means, precisions, 1.0, np.zeros(CHANNELS), _SCALES, 1.0)
 
 
 def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -105,9 +94,9 @@ def place_effects(pad: Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def even_contacts(presses: PressSet, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return usable contacts (n, channels) as even sensors read them, and the constants (n, p) of their pads.
+    """Return usable contacts (n, channels) as even sensors read the newest presses, and their constants (n, p).
 
-    The presses are whole sets of `make_presses`, whose pads can be drawn again; of each sequence it is the newest one.
+    The presses are whole sets of `make_presses`, whose pads can be drawn again.
     """
     rng = np.random.default_rng(seed)
     cross = rng.random(len(presses))
@@ -130,10 +119,7 @@ def even_contacts(presses: PressSet, seed: int) -> tuple[NDArray[np.float64], ND
 
 
 def fit_mixture(presses: PressSet) -> ContactMixture:
-    """Fit the mixture by expectation-maximisation to presses, as of `even_contacts`.
-
-    DatasetError if they are fewer than two for each channel.
-    """
+    """Fit the mixture by expectation-maximisation to presses; DatasetError below two for each channel."""
     contacts, constants = even_contacts(presses, seed=0)
     design = np.insert(constants, 0, 1.0, axis=1)
     components = min(48, len(contacts) // (2 * CHANNELS))
@@ -145,8 +131,8 @@ def fit_mixture(presses: PressSet) -> ContactMixture:
     return mixture
 
 
+# Contacts (n, 3, rows, cols) of a sensor, its true log-gains (channels,), and the constants (p,) of its pad.
 Sensor = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
-"""Contacts (n, 3, rows, cols) of a sensor, its true log-gains (channels,), and the constants (p,) of its pad."""
 
 
 def sensors_of(presses: PressSet, world: World) -> list[Sensor]:
@@ -175,10 +161,11 @@ def _even_z(gripped: GrippedPad) -> NDArray[np.float64]:
 
 def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactModel:
     """Return the model with its mean error on sensors taken out, and with intervals that hold nine in ten values."""
-    plain = [learned(contacts, mixture.model(), 1) for contacts, _, _ in sensors]
+    model = mixture.model()
+    plain = [learned(contacts, model, 1) for contacts, _, _ in sensors]
     off = [np.log(learner.gains) - true for learner, (_, true, _) in zip(plain, sensors, strict=True)]
-    bias = _symmetric(np.mean(off, axis=0))
-    taught = [learned(contacts, mixture.model(1.0, bias), 1) for contacts, _, _ in sensors]
+    model = replace(model, bias=_symmetric(np.mean(off, axis=0)))
+    taught = [learned(contacts, model, 1) for contacts, _, _ in sensors]
     gains = [
         (np.log(learner.gains) - true) / learner.deviations
         for learner, (_, true, _) in zip(taught, sensors, strict=True)
@@ -187,7 +174,7 @@ def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactMod
         ((learner.constants - true) / learner.constant_deviations)[:-1][learner.determined[:-1]]
         for learner, (_, _, true) in zip(taught, sensors, strict=True)  # the cross-talk of a sensor is not available
     ]
-    return mixture.model(_widening(gains), bias, _widening(constants))
+    return replace(model, widening=_widening(gains), constant_widening=_widening(constants))
 
 
 def _widening(ratios: Sequence[NDArray[np.floating]]) -> float:

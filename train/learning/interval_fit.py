@@ -1,12 +1,10 @@
 """Calibration of deviations, and fit of a network's interval correction.
 
-A deviation becomes an interval as that of a Laplace density, which the networks are trained with. The factor is an
-empirical quantile, so that the level of the calibration is correct for any density of the errors; the other levels are
-as accurate as the Laplace density.
+A deviation becomes an interval as that of a Laplace density, which the networks are trained with; the factor is an
+empirical quantile, so that LEVEL is correct for any density of the errors.
 
 Weights of a correction are fitted on training presses: the factors that cover a share LEVEL of the errors sampled in
-each region minimise the pinball loss of their logarithm, so every pixel counts the same whatever its size. The
-conformal step then shifts the factors of each region and each number of taps until validation presses are covered.
+each region minimise the pinball loss of their logarithm, so every pixel counts the same whatever its size.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,10 +33,10 @@ _SAMPLES: Final = 24  # pixels of each region of a window
 _RATE: Final = 5e-3
 _LEAST_RATIO: Final = 1e-3
 
+# Function from windows in network units, pads and poses to patterns and deviations, in [mm].
 Run = Callable[
     [NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.float32] | None], Sequence[NDArray[np.float32]]
 ]
-"""Function from windows in network units, pads and poses to patterns and deviations, in [mm]."""
 
 
 def half_width_mm(deviation_mm: ArrayLike) -> NDArray[np.floating]:
@@ -78,10 +76,7 @@ class Readings:
 def readings_of_presses(
     presses: PressSet, taps: int, times: int = 3, *, sensor: OneSensor | None = None
 ) -> list[Readings]:
-    """Return presses as sensors of their own read them, with nothing and with everything known of each sensor.
-
-    Of `sensor` is known what its file states, and nothing.
-    """
+    """Return presses as sensors of their own, or `sensor`, read them, with nothing and with all known of each."""
     readings = []
     for number in range(times):
         frozen = freeze_presses(presses, SEED + number, Nuisances() if sensor is None else sensor.nuisances)
@@ -124,8 +119,7 @@ def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, ste
 def conform(net: CompactNet, run: Run, readings: Sequence[Readings]) -> dict[str, list[float]]:
     """Shift a network's correction, per region and number of taps, until it covers LEVEL of the readings' pixels.
 
-    Returns:
-        For each of LEVELS, in percent, the deviations that make half of its interval in each region.
+    Returned are, for each of LEVELS in percent, the deviations that make half of its interval in each region.
     """
     if (correction := net.intervals) is None:
         raise ValueError("the network has no correction of intervals: fit one first")

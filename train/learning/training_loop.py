@@ -1,17 +1,11 @@
-"""Training loop for every network: mixed precision, several devices, resumable, and reproducible for one seed.
+"""Training loop for every network: mixed precision, resumable, and reproducible for one seed.
 
-On a GPU a seed reproduces the weights up to the order of additions.
-
-Under torchrun every process takes its share of each batch, and gradients are averaged: the weights are those of one
-process up to the order of additions, except for batch normalisation, which sees the share alone.
-
-    torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/train.npz
+One process uses all cores, or one GPU, on which a seed reproduces the weights up to the order of additions.
 """
 
 import hashlib
 import io
 import json
-import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -21,8 +15,7 @@ from pickle import UnpicklingError
 from typing import Any, Final
 
 import torch
-from torch import distributed, nn
-from torch.nn.parallel import DistributedDataParallel
+from torch import nn
 
 from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
@@ -35,10 +28,10 @@ Batches = Callable[[int], Batch]  # function from a number to its batch; the sam
 _WARM_UP: Final = 0.1
 _FIRST_SHARE: Final = 1 / 25
 _LAST_SHARE: Final = 1e-5
+_CLIP_NORM: Final = 1.0  # largest norm of a gradient
 
-
+# Errors of loading a file that is not what it should be.
 DAMAGES: Final = (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError)
-"""Errors of loading a file that is not what it should be."""
 
 
 def reason(error: BaseException) -> str:
@@ -55,10 +48,9 @@ class Recipe:
     """Hyperparameters of a training."""
 
     steps: int  # of the optimizer
-    batch: int = 64  # windows, shared by all devices
+    batch: int = 64  # windows
     learning_rate: float = 2e-3  # highest of the one cycle
     weight_decay: float = 0.0  # of AdamW
-    clip_norm: float = 1.0  # largest norm of a gradient
     given: tuple[float, ...] = (1.0,)  # share of windows with 1, 2, ... K taps; older taps are dropped
     bf16: bool = False  # multiply in bfloat16 and add in float32, on a device where that is faster
 
@@ -66,29 +58,6 @@ class Recipe:
         for name in ("steps", "batch", "learning_rate"):
             if not (value := getattr(self, name)) > 0:
                 raise CheckpointError(f"{name} is {value}, expected more than 0")
-
-
-def rank_and_world() -> tuple[int, int]:
-    """Return the rank of this process and the number of processes; joins torchrun's group on the first call."""
-    if "WORLD_SIZE" not in os.environ:
-        return 0, 1
-    if not distributed.is_initialized():
-        distributed.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-        _keep_apart(int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"]))  # ranks on this machine
-    return distributed.get_rank(), distributed.get_world_size()
-
-
-def _keep_apart(rank: int, world: int) -> None:
-    """Pin one of several processes of a machine without a GPU to its share of the available cores.
-
-    Without it the kernel kept two processes on one core for minutes, while the other core was idle.
-    """
-    if world == 1 or torch.cuda.is_available() or not hasattr(os, "sched_setaffinity"):
-        return
-    cores = sorted(os.sched_getaffinity(0))
-    share = cores[rank * len(cores) // world : (rank + 1) * len(cores) // world]
-    if share:  # with more processes than cores, the kernel schedules them
-        os.sched_setaffinity(0, share)
 
 
 def gains_by_bf16(device: torch.device) -> bool:
@@ -99,22 +68,9 @@ def gains_by_bf16(device: torch.device) -> bool:
     return bool(able.get("avx512_bf16") or able.get("amx_bf16") or able.get("bf16"))
 
 
-def wait_for_all() -> None:
-    """Wait until all processes have reached this point."""
-    if distributed.is_initialized():
-        distributed.barrier()
-
-
-def leave_group() -> None:
-    """End torchrun's group with all processes at once: one that leaves first would close the others' connections."""
-    if distributed.is_initialized():
-        wait_for_all()
-        distributed.destroy_process_group()
-
-
-def device_of_rank(rank: int) -> torch.device:
-    """Return the device on which a process computes."""
-    return torch.device("cuda", rank % torch.cuda.device_count()) if torch.cuda.is_available() else torch.device("cpu")
+def best_device() -> torch.device:
+    """Return the GPU if there is one, else the processor."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def learning_rate_share(progress: float) -> float:
@@ -134,27 +90,18 @@ def train(
     identity: str = "",
     keep_every_s: float = 60.0,
 ) -> tuple[float, dict[int, float]]:
-    """Train a network in place, and leave it in evaluation mode.
+    """Train a network in place, and return the seconds that it took, and the loss of a hundred steps by their numbers.
 
-    Returned are the seconds that all parts of the run took, and the loss of a hundred steps by their numbers.
-
-    An interrupted run resumes when this is called again with the same `identity`, of network and data, from the state
-    in `resume_path`, which the caller deletes when the result is safe. CheckpointError if a batch cannot be shared
-    evenly by the processes, DivergedError if the loss is not finite; the network is then as before that step.
+    A run that was interrupted resumes when this is called again with the same `identity`, of network and data, from the
+    state in `resume_path`, which the caller deletes when the result is safe. DivergedError if the loss is not finite;
+    the network is then as before that step.
     """
-    rank, world = rank_and_world()
-    if recipe.batch % world:
-        raise CheckpointError(
-            f"a batch of {recipe.batch} windows is shared by {world} processes: expected as many for each"
-        )
-    device = device_of_rank(rank)
-    _place(net, device).train()
+    device = best_device()
+    net.to(device).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
-    parallel = DistributedDataParallel(net) if world > 1 else net
     parts = {"net": net, "optimizer": optimizer, "objective": objective}
     recipe_sha256 = hashlib.sha256(json.dumps([asdict(recipe), identity], sort_keys=True).encode()).hexdigest()
     state = _restored(resume_path, parts, recipe_sha256, device)
-    wait_for_all()  # the first process to finish may delete the state
     first, kept_s = state["step"], time.monotonic()
     started_s = kept_s - state["elapsed_s"]
     course: dict[int, float] = state["course"]
@@ -163,12 +110,12 @@ def train(
             rate = recipe.learning_rate * learning_rate_share((step - 1) / recipe.steps)
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            batch = batches(step - 1).share(rank, world, device)
+            batch = batches(step - 1).to(device)
             with torch.autocast(device.type, torch.bfloat16, enabled=recipe.bf16 and gains_by_bf16(device)):
-                descended = objective.loss(parallel, batch)
+                descended = objective.loss(net, batch)
             optimizer.zero_grad()
             descended.backward()
-            norm = float(nn.utils.clip_grad_norm_(net.parameters(), recipe.clip_norm))
+            norm = float(nn.utils.clip_grad_norm_(net.parameters(), _CLIP_NORM))
             loss = float(descended.detach())
             if not (isfinite(norm) and isfinite(loss)):
                 raise DivergedError(f"{resume_path.stem}: loss {loss} at step {step - 1}: lower the learning rate")
@@ -179,20 +126,13 @@ def train(
                 course[step] = round(loss, 5)
                 bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
             now_s = time.monotonic()
-            if rank == 0 and now_s - kept_s > keep_every_s:
-                facts = {"recipe": recipe_sha256, "step": step, "elapsed_s": now_s - started_s, "course": course}
-                _keep(resume_path, parts, facts)
+            if now_s - kept_s > keep_every_s:
+                kept = {name: part.state_dict() for name, part in parts.items()} | {"recipe": recipe_sha256}
+                kept |= {"step": step, "elapsed_s": now_s - started_s, "course": course}
+                write_state(resume_path, kept, keep_before=False)
                 kept_s = time.monotonic()
     net.eval()
     return time.monotonic() - started_s, course
-
-
-def _place(net: PatternNet, device: torch.device) -> PatternNet:
-    """Move a network to a device; on a GPU with channels last and cudnn's benchmark: 28 ms a step, not 34 (H100)."""
-    if device.type != "cuda":
-        return net.to(device)
-    torch.backends.cudnn.benchmark = True
-    return nn.utils.convert_conv2d_weight_memory_format(net.to(device), torch.channels_last)
 
 
 def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
@@ -208,12 +148,6 @@ def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: 
     for name, part in parts.items():
         part.load_state_dict(state[name])
     return state
-
-
-def _keep(path: Path, parts: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
-    """Keep the state of a run on disk, so that an interruption costs at most a minute."""
-    state = {name: part.state_dict() for name, part in parts.items()} | dict(facts)
-    write_state(path, state, keep_before=False)
 
 
 def write_state(path: Path, state: Mapping[str, Any], *, keep_before: bool = True) -> None:

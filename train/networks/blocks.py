@@ -10,19 +10,12 @@ from train.data.press_batches import Batch
 
 
 class PatternNet(nn.Module):
-    """Network from windows (n, 3K, rows, cols) in network units, newest tap first, to patterns (n, H, W) in [mm].
+    """Network from windows (n, 3K, rows, cols) in network units, newest tap first, to patterns (n, H, W) in [mm]."""
 
-    Attributes:
-        taps: K.
-        scale: pattern pixels per taxel pitch.
-        known: numbers that it takes of the pad's constants.
-        takes_poses: True if it takes the poses of the taps as well, and any number of taps up to K.
-    """
-
-    taps: int
-    scale: int
-    known: int = 0
-    takes_poses: bool = False
+    taps: int  # K
+    scale: int  # pattern pixels per taxel pitch
+    known: int = 0  # numbers that it takes of the pad's constants
+    takes_poses: bool = False  # those of the taps as well, and any number of taps up to K
 
     def take_over(self, start: "PatternNet") -> None:
         """Copy another network's weights; RuntimeError or ValueError if they do not fit."""

@@ -6,9 +6,8 @@ uncertainty of each pixel, the traction on the pad, and the pad's constants as a
 under quarter turns.
 
 A deviation alone has one bias in the contact and another around it, and one for a contact that covers the pad and
-another for a wire. The correction of intervals multiplies it by one of four factors, by the pixel's region; a small
-network computes the four from a summary of the window. It is part of the graph, so everything reads corrected
-deviations.
+another for a wire. The correction of intervals, a part of the graph, multiplies it by one of four factors, by the
+pixel's region; a small network computes the four from a summary of the window.
 """
 
 from math import expm1, log, sqrt
@@ -25,13 +24,11 @@ from train.networks.blocks import Objective, PatternNet, Residual, relative_rms_
 from train.networks.symmetric import Group, SymmetricConv2d, fields, scalars, vectors
 
 _HIDDEN: Final = 32
-_MOST_INPUT: Final = 4.0
-"""Bound of an input in standard deviations over the training presses, so that nothing unlike them is extrapolated."""
-LOG_RANGE: Final = (-1.5, 2.5)
-"""Bounds of a factor's logarithm: a window unlike all others widens its intervals twelvefold at most."""
+_MOST_INPUT: Final = 4.0  # bound of an input in standard deviations over the training presses
+LOG_RANGE: Final = (-1.5, 2.5)  # of a factor: a window unlike all others widens its intervals twelvefold at most
 _MASKS: Final = 3
+# Masks that hold a region, in the order of REGIONS, and 1 for all pixels.
 _OF_REGIONS: Final = torch.tensor([[1.0, 1, 0, 1], [1, 1, 1, 1], [1, 0, 1, 1], [0, 0, 1, 1]])
-"""Masks that hold a region, in the order of REGIONS, and 1 for all pixels."""
 
 
 class IntervalCorrection(nn.Module):
@@ -40,20 +37,15 @@ class IntervalCorrection(nn.Module):
     A factor's logarithm is the sum of what three overlapping masks add, and of what all pixels have: the four
     regions in the fewest steps of a graph. Of the `features`, so many consecutive ones as there are `symmetries` are
     permuted by these, which do not change their mean; `about` is the number of the pad's inputs and the amplitude.
-
-    Attributes:
-        near: pixels outside the contact that are near it.
-        contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        centre: mean of each input over the training presses; `spread` is the standard deviation.
     """
 
-    contact_level: Tensor
-    centre: Tensor
-    spread: Tensor
+    contact_level: Tensor  # share of a pattern's maximum from which a pixel counts as touched
+    centre: Tensor  # mean of each input over the training presses
+    spread: Tensor  # standard deviation of each
 
     def __init__(self, scale: int, features: int, symmetries: int, about: int, taps: int) -> None:
         super().__init__()
-        self.near = near_pixels(scale, USPA44.pitch_mm)
+        self.near = near_pixels(scale, USPA44.pitch_mm)  # pixels outside the contact that are near it
         self._symmetries = symmetries
         inputs = features // symmetries + about + _MASKS + 2 + taps - 1
         self.register_buffer("contact_level", torch.tensor(0.5))
@@ -81,14 +73,9 @@ class IntervalCorrection(nn.Module):
     def summary(
         self, features: Tensor, pattern: Tensor, deviation: Tensor, about: Tensor, later: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the masks (n, 3, H, W), and the inputs of the factors, (n, inputs).
+        """Return the masks (n, 3, H, W), and the inputs of the factors, (n, inputs); arguments are parts of `Seen`.
 
-        Args:
-            features: (n, channels, h, w).
-            pattern: (n, H, W), cut at zero, of a tap of amplitude 1.
-            deviation: (n, H, W) to be corrected, of a tap of amplitude 1.
-            about: (n, ...), the pad's inputs and the bounded amplitude.
-            later: (n, K - 1), 1 for each earlier tap that is there, else 0.
+        The pattern is cut at zero, and of a tap of amplitude 1, as the deviation.
         """
         peak = pattern.amax(dim=(1, 2), keepdim=True)
         masks = self.masks(pattern, peak)
@@ -119,12 +106,8 @@ class IntervalCorrection(nn.Module):
             self.leave.weight[:, _HIDDEN + taps - 1] -= steps
 
 
-QUIET_UNITS: Final = 0.02
-"""Amplitude in network units, added to a tap's own before the division by it: noise and absent taps stay small."""
-TRACTION_SCALE: Final = 2
-"""Traction pixels per taxel pitch: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
-_MOST_LOGIT: Final = 8.0
-"""Bound of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 8 mm."""
+QUIET_UNITS: Final = 0.02  # added to a tap's amplitude before the division by it: noise and absent taps stay small
+_MOST_LOGIT: Final = 8.0  # of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 8 mm
 
 
 class CompactNet(PatternNet):
@@ -132,21 +115,14 @@ class CompactNet(PatternNet):
 
     A tap enters the pattern branch divided by its own amplitude, which multiplies the result: a flat contact's pattern
     is nearly linear in its force, so the trunk has to learn shapes only, and no force is out of its range. The
-    amplitude itself enters as a bounded number, for the nonlinear part. `known` numbers state constants of the pad,
-    `intervals` corrects the deviations by region as `add_intervals` does. ValueError if the scale is odd, or channels
-    do not divide.
+    amplitude itself enters as a bounded number, for the nonlinear part. `known` numbers state constants of the pad.
+    ValueError if the scale is odd, or channels do not divide.
     """
 
     deviation_scale: Tensor  # factor on the deviation, see train.learning.interval_fit.calibrate
 
     def __init__(
-        self,
-        scale: int,
-        channels: int,
-        blocks: int,
-        known: int = 0,
-        group: Group = "p4",
-        intervals: bool = False,
+        self, scale: int, channels: int, blocks: int, known: int = 0, group: Group = "p4", intervals: bool = False
     ) -> None:
         super().__init__()
         if scale < 2 or scale % 2:
@@ -203,15 +179,13 @@ class CompactNet(PatternNet):
     def forward(self, window: Tensor, pad: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Return patterns and their deviations, both (n, H, W) in [mm], and tractions (n, 3, h, w) in [kPa].
 
-        Patterns are cut at zero in evaluation but not in training: a sub-pixel that is cut everywhere would never learn
-        again. Deviations are always above zero; their loss does not train the features of the pattern.
-
         Windows are (n, 3, rows, cols) in network units, constants of the pads (n, known), None for none.
         """
         return self.finished(self.see(window, pad))
 
     def finished(self, seen: "Seen") -> tuple[Tensor, Tensor, Tensor]:
         """Return the outputs at the newest tap's amplitude; in evaluation cut at zero, and corrected by region."""
+        # In training a sub-pixel that is cut everywhere would never learn again.
         if self.training:
             return seen.pattern * seen.newest, seen.deviation * seen.newest, seen.traction
         pattern, deviation = torch.relu(seen.pattern), seen.deviation
@@ -254,10 +228,9 @@ class CompactNet(PatternNet):
         return Seen(features, newest, entered.about, later, pattern, deviation, traction)
 
     def take_over(self, start: PatternNet) -> None:
-        """Copy another network's function of the newest tap.
+        """Copy another network's function of the newest tap; ValueError if kind, width or inputs of the pad are others.
 
-        From fewer symmetries to more, the asymmetric part is lost. At another scale the output layers are initialised
-        again. ValueError if kind, width or inputs of the pad are others.
+        From fewer symmetries to more, the asymmetric part is lost. At another scale the output layers stay new.
         """
         if not isinstance(start, CompactNet):
             raise ValueError("expected a compact network")
@@ -308,26 +281,23 @@ class Seen(NamedTuple):
     traction: Tensor  # (n, 3, h, w) in [kPa]
 
 
-WORSE_BY_TAPS: Final = 0.4
-"""Weight of the logarithm by which a pattern is worse than that of the same window's newest tap alone."""
+_WORSE_BY_TAPS: Final = 0.4  # weight of the logarithm by which a pattern is worse than by the newest tap alone
 
 
 class HeteroscedasticError(Objective):
     """Objective of a network that predicts a pattern and its deviation: see `heteroscedastic_loss`."""
 
     def loss(self, net: nn.Module, batch: Batch) -> Tensor:
-        """Return the relative errors of patterns and tractions, and the likelihood loss of the deviations.
-
-        What earlier taps make worse counts once more, so that a network learns when to lean on the newest one.
-        """
+        """Return the relative errors of patterns and tractions, and the likelihood loss of the deviations."""
         posed = () if batch.poses is None else (batch.poses,)
         pattern, deviation, traction = net(batch.window, batch.pad, *posed)
         loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
         if batch.poses is not None and batch.poses.shape[1] > 1:
+            # What earlier taps make worse counts once more: so a network learns when to lean on the newest one.
             with torch.no_grad():
                 alone = net(batch.window[:, :3], batch.pad, batch.poses[:, :1])[0]
             share = relative_rms_errors(pattern, batch.pattern) / relative_rms_errors(alone, batch.pattern)
-            loss = loss + WORSE_BY_TAPS * torch.relu(share.log()).mean()
+            loss = loss + _WORSE_BY_TAPS * torch.relu(share.log()).mean()
         if batch.traction is not None:
             simulated = batch.traction.isfinite().all(dim=(1, 2, 3))  # of a real sensor's taps it is not
             traction, truth = traction[simulated], batch.traction[simulated]

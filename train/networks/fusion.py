@@ -34,10 +34,7 @@ _CELL_MM: Final = USPA44.pitch_mm / _CELLS
 
 
 class FusionNet(CompactNet):
-    """Network from a window of 1 to K taps, K of two at least, and their poses to pattern, deviation and traction.
-
-    `shape` is of a `CompactNet`: channels, blocks, known and group.
-    """
+    """Network from a window of 1 to K taps, K of two at least, and their poses to pattern, deviation and traction."""
 
     takes_poses = True
     reach_to: Tensor
@@ -104,10 +101,10 @@ class FusionNet(CompactNet):
     def forward(
         self, window: Tensor, pad: Tensor | None = None, poses: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `CompactNet.forward` does, of windows of 1 to K taps.
+        """Return what `CompactNet.forward` does, of windows (n, 3k, rows, cols) or (n, k, 3, rows, cols) of k taps.
 
-        Windows are (n, 3k, rows, cols) or (n, k, 3, rows, cols), poses (n, k, 5): x, y in [mm] and turn in [deg] of
-        each tap in the newest one's axes, then the standard deviations of both; None for the paper's schedule.
+        Poses (n, k, 5) are x, y in [mm] and turn in [deg] of each tap in the newest one's axes, then the standard
+        deviations of both; None for the paper's schedule.
         """
         return self.finished(self.see(window, pad, poses))
 
@@ -152,17 +149,14 @@ class _Carrier:
     """Exchange of features between the cells of earlier taps and those of the newest one, by the taps' poses.
 
     A weight is a Gaussian of two cells' distance; the error of the pose widens it. Cells of an earlier tap are in the
-    order in which its channels hold them: the four parts of a taxel first, then rows and columns.
-
-    Args:
-        poses: (n, k - 1, 5) of the earlier taps; `inputs`, (n, k - 1, 7), are these as the encoder takes them.
-        there: (n, k - 1, 1, 1, 1), 1 for each that is there, else 0; `any`, (n, 1, 1, 1), is 1 where some tap is.
-        grid: taxels of a pad, (rows, cols).
-        reaches: variances of the Gaussians in cells, to the newest tap and from it.
+    order in which its channels hold them: the four parts of a taxel first, then rows and columns. Poses are
+    (n, k - 1, 5) of the earlier taps, and `there` (n, k - 1, 1, 1, 1) is 1 for each that is there, else 0. The grid is
+    (rows, cols); reaches are variances of the Gaussians in cells, to the newest tap and from it.
     """
 
     def __init__(self, poses: Tensor, there: Tensor, grid: tuple[int, int], reaches: Sequence[Tensor]) -> None:
         self._taps, self._grid, self._cells = poses.shape[:2], grid, _CELLS**2 * grid[0] * grid[1]
+        # (n, 1, 1, 1), 1 where some earlier tap is there.
         self.any = (there.sum(dim=1) > 0).to(poses.dtype)
         self._there = there.transpose(1, 2)[..., 0]  # (n, 1, k - 1, 1)
         constants = [torch.from_numpy(array).to(poses.dtype) for array in (*_encoding(), *_geometry(*grid))]
@@ -185,10 +179,7 @@ class _Carrier:
             self._weights.append(torch.exp((here @ over).clamp_max(0.0)))
 
     def to_newest(self, sent: Tensor) -> Tensor:
-        """Return channels and the logarithms of their weights, (n, c + heads, H, W), of what taps sent.
-
-        That is (n (k - 1), 4 (c + heads), rows, cols).
-        """
+        """Return channels and log weights, (n, c + heads, H, W), of what taps sent, (n (k - 1), ..., rows, cols)."""
         cells = sent.reshape(*self._taps, _CARRIED + _HEADS, self._cells).transpose(1, 2)
         weight = F.softplus(cells[:, _CARRIED:]) * self._there
         weighted = cells[:, :_CARRIED].unflatten(1, (_HEADS, -1)) * weight[:, :, None]

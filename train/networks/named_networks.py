@@ -1,13 +1,4 @@
-"""Networks by name, each with its width.
-
-The bundled models are these, at scale 10; `edge/inference/bundled.py` names the default:
-
-| model | network | channels | residual blocks |
-|---|---|---|---|
-| stsr | compact-stsr | 64 | 6 |
-| stsr-small | small-stsr | 32 | 4 |
-| mtsr | fusion-mtsr7 | 64 | 6 |
-"""
+"""Networks by name, each with its width; those of the bundled models are in `train.fit.BUNDLED`."""
 
 from collections.abc import Callable
 from typing import Any, Final
@@ -21,6 +12,7 @@ from train.networks.published import MAX_TAPS, SeedNet, TactileSRCNN, TactileSRG
 _TAPS: Final = {"stsr": 1} | {f"mtsr{taps}": taps for taps in range(2, MAX_TAPS + 1)}
 _WIDE: Final = {"channels": 64, "blocks": 6}
 
+# Class of each network, and the arguments that options may replace, by name.
 NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     "srcnn": (TactileSRCNN, {}),
     "srgan": (TactileSRGAN, {}),
@@ -29,7 +21,6 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     **{f"fusion-{name}": (FusionNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items() if taps > 1},
     "small-stsr": (CompactNet, {"channels": 32, "blocks": 4}),  # a quarter of the work
 }
-"""Class of each network, and the arguments that options may replace, by name."""
 
 
 def build(name: str, scale: int, **options: Any) -> PatternNet:
@@ -41,11 +32,7 @@ def build(name: str, scale: int, **options: Any) -> PatternNet:
 
 
 def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNet:
-    """Build a new network that starts from copies of another's weights; CheckpointError if the weights do not fit.
-
-    A network of several taps can start from one of a single tap, and any from its own kind. At another scale a compact
-    network keeps its trunk, and its output layers are initialised again.
-    """
+    """Build a new network that starts from copies of another's weights; CheckpointError if the weights do not fit."""
     net = build(name, scale, **options)
     try:
         net.take_over(start)

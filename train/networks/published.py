@@ -8,16 +8,12 @@ TactileSRGAN is TactileSRCNN trained against a discriminator. From the authors' 
 penalty 10, two steps of the discriminator to one of the generator, 0.001 of the adversarial loss added to the error.
 Chosen here: the discriminator's layers, which score patches and take any scale, without batch normalisation; and its
 input, patterns relative to their truth's size.
-
-The paper's own pad and schedule make the presses to train them on:
-
-    python -m train.data.make_presses data/paper.npz --families paper --schedule turns --spread 0 --taps 7
 """
 
 from typing import Any, Final
 
 import torch
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from train.data.press_batches import Batch
@@ -56,20 +52,17 @@ class _PublishedNet(PatternNet):
         return F.interpolate(window, scale_factor=self.scale, mode="bilinear", align_corners=False)
 
     def _pattern(self, output: Tensor) -> Tensor:
-        """Convert the last convolution, (n, 1, H, W), to patterns (n, H, W) in [mm].
-
-        They are cut at zero in evaluation; in training too, as published, 3 of 16 seeds tried would never learn.
-        """
+        """Convert the last convolution, (n, 1, H, W), to patterns (n, H, W) in [mm], cut at zero in evaluation."""
         # The networks were made for patterns of up to 25, those here reach 0.5 mm.
         pattern = output[:, 0].float() * 0.02
+        # Cut in training too, as published, 3 of 16 seeds tried would never learn.
         return pattern if self.training else torch.relu(pattern)
 
 
 class SeedNet(_PublishedNet):
     """Network from a window of K taps to a pattern: STSR with one tap, MTSR-K with more.
 
-    Taps are interpolated, each passes its stem, and they are merged; the newest tap also passes a branch without batch
-    normalisation, which would remove the force.
+    The newest tap also passes a branch without batch normalisation, which would remove the force.
     """
 
     def __init__(self, taps: int, scale: int) -> None:
@@ -89,17 +82,13 @@ class SeedNet(_PublishedNet):
         return self._pattern(self.leave(torch.cat([self.force(taps[0]), pattern], dim=1)))
 
     def take_over(self, start: PatternNet) -> None:
-        """Copy another network's weights; after an STSR's an MTSR-K computes the same until it is trained.
-
-        Every stem starts as the STSR's. In the merging layer the earlier taps have zero weights: these weights learn
-        from the first step on, the stems before them from the second.
-        """
+        """Copy another network's weights; after an STSR's an MTSR-K computes the same until it is trained."""
         state = dict(start.state_dict())
         if isinstance(start, SeedNet) and start.taps == 1:
             stem = {name: value for name, value in state.items() if name.startswith("stems.0.")}
             for tap in range(1, self.taps):
                 state |= {name.replace("stems.0.", f"stems.{tap}."): value for name, value in stem.items()}
-            newest = state["merge.0.weight"]
+            newest = state["merge.0.weight"]  # in this layer the earlier taps begin with zeros
             state["merge.0.weight"] = torch.cat([newest, *[torch.zeros_like(newest)] * (self.taps - 1)], dim=1)
         self.load_state_dict(state)
 
@@ -146,7 +135,7 @@ class _MultiScaleResidual(nn.Module):
 
 
 def _plain(inputs: int, outputs: int | None = None, kernel: int = 3, *, bias: bool = False) -> nn.Conv2d:
-    """Build a convolution that keeps the size, and the number of channels unless `outputs` is given."""
+    """Build a convolution that keeps the size, and without `outputs` the number of channels."""
     return nn.Conv2d(inputs, inputs if outputs is None else outputs, kernel, padding=kernel // 2, bias=bias)
 
 
@@ -157,7 +146,7 @@ def _normed(inputs: int, outputs: int | None = None, kernel: int = 3, *, bias: b
 
 
 class Discriminator(nn.Module):
-    """Discriminator: a score without unit, higher for patterns that look more like true ones."""
+    """A score without unit, higher for patterns that look more like true ones."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -202,7 +191,6 @@ class SrganObjective(Objective):
         for _ in range(2):
             self._optimizer.zero_grad()
             self.critic_loss(*self._seen).backward()
-            _average_gradients(self.critic)
             self._optimizer.step()
         self._seen = None
 
@@ -225,13 +213,3 @@ class SrganObjective(Objective):
         self.critic.load_state_dict(state["critic"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._rng.set_state(state["rng"].cpu())
-
-
-def _average_gradients(net: nn.Module) -> None:
-    """Average gradients over the processes of a run, because DDP does not support the gradient of a gradient."""
-    if not distributed.is_initialized():
-        return
-    for parameter in net.parameters():
-        if parameter.grad is not None:
-            distributed.all_reduce(parameter.grad)
-            parameter.grad /= distributed.get_world_size()

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+# The half turn, as any rectangle has it, the four quarter turns, or these and their mirror images.
 Group = Literal["p2", "p4", "p4m"]
-"""Symmetries: the half turn, as any rectangle has it, the four quarter turns, or these and their mirror images."""
 
 _ELEMENTS: Final[dict[Group, tuple[tuple[int, bool], ...]]] = {
     "p2": ((0, False), (2, False)),
@@ -76,10 +76,7 @@ def vectors(group: Group, count: int = 1) -> Channels:
 
 
 def fields(group: Group, channels: int) -> Channels:
-    """Return hidden channels in groups of as many as there are symmetries, which permute them.
-
-    ValueError if they do not divide.
-    """
+    """Return hidden channels in groups of as many as there are symmetries, which permute them."""
     elements = len(_ELEMENTS[group])
     if channels % elements:
         raise ValueError(f"{channels} channels, expected a multiple of the {elements} symmetries of {group}")

@@ -1,9 +1,8 @@
 """Network of the tactile PSF: from a scan to the PSF that spreads the depth of its contact.
 
-The network estimates alpha and beta from a scan, and gamma for the sensor. Depth and PSF give the HR pattern, the
-pattern degraded to the taxels gives the scan's z again, and the difference trains the network: no HR truth is needed.
-Alpha has the scan's unit per area, since only the product of alpha and the taxels' sensitivity is visible in a scan;
-k_scale converts that into [mm].
+Depth and PSF give the HR pattern, the pattern degraded to the taxels gives the scan's z again, and the difference
+trains the network: no HR truth is needed. Alpha has the scan's unit per area, since only the product of alpha and the
+taxels' sensitivity is visible in a scan; k_scale converts that into [mm].
 
 Source: Wu and Liu 2024, Fig. 4, Section IV-C, Eq. 4-10.
 """
@@ -36,13 +35,9 @@ class PsfParameters:
 
 
 class PsfNet(nn.Module):
-    """Network from a scan to alpha and beta, 48 -> 256 -> 1024 -> 256 -> 2, ReLU, softplus; gamma is one number.
+    """Network from a scan to alpha and beta, 48 -> 256 -> 1024 -> 256 -> 2, ReLU, softplus; gamma is one number."""
 
-    Attributes:
-        k_scale: (), the constant of Eq. 5, in [mm] of pattern per [counts / 100 / mm^2]; 1 until it is fitted.
-    """
-
-    k_scale: Tensor
+    k_scale: Tensor  # of Eq. 5, in [mm] of pattern per [counts / 100 / mm^2]; 1 until it is fitted
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,17 +61,12 @@ class PsfNet(nn.Module):
         pixel_mm = USPA44.pitch_mm * USPA44.rows / depth.shape[1]
         return self.k_scale * tpsf(depth, read.alpha, read.beta_mm, pixel_mm)
 
-    def degraded(self, read: PsfParameters, depth: Tensor) -> Tensor:
-        """Return the z readings (n, rows, cols) of the patterns, in [counts / 100]."""
-        return degrade(self.pattern(read, depth) / self.k_scale, read.gamma)
-
     def loss(self, counts: Tensor, depth: Tensor) -> Tensor:
-        """Return the squared error of the z readings, summed over the taxels, mean over the scans; Eq. 9-10.
-
-        Only the positive part of a reading counts: next to a contact the pad bulges, and in fitting that beta would
-        vanish.
-        """
-        error = self.degraded(self(counts), depth) - pressed(counts)
+        """Return the squared error of the z readings, summed over the taxels, mean over the scans; Eq. 9-10."""
+        read = self(counts)
+        # Next to a contact the pad bulges, and in fitting that beta would vanish.
+        pressed = counts[:, 2].clamp_min(0.0) / COUNTS_PER_UNIT
+        error = degrade(self.pattern(read, depth) / self.k_scale, read.gamma) - pressed
         return (error**2).sum(dim=(1, 2)).mean()
 
 
@@ -87,11 +77,6 @@ def tpsf(depth: Tensor, alpha: Tensor, beta_mm: Tensor, pixel_mm: float) -> Tens
     """
     response = alpha[:, None, None] * spread(depth, beta_mm, pixel_mm)
     return torch.where(depth >= 0.5, response.amax(dim=(1, 2), keepdim=True), response)
-
-
-def pressed(counts: Tensor) -> Tensor:
-    """Return the positive part of the z readings, (n, rows, cols) of (n, 3, rows, cols), in [counts / 100]."""
-    return counts[:, 2].clamp_min(0.0) / COUNTS_PER_UNIT
 
 
 def degrade(pattern: Tensor, gamma: Tensor) -> Tensor:

@@ -6,11 +6,10 @@ readings then change continuously while the surface moves, where whole cells alo
 (docs/decisions.md).
 
 Friction follows from the pressure, and the slide and turn of the surface since first contact. A cell in contact sticks,
-and moves with the surface, or slips, and bears the traction mu p against its slip (Coulomb; Cattaneo 1938 and Mindlin
-1949 for spheres). One step of monotone loading: pressure first, then slide and twist together, without history. That is
-a convex problem: the least of 1/2 t C t - t g over tractions with |t| <= mu p in each cell, C the pad's compliance and
-g the surface's movement. It is solved by spectral projected gradients (Birgin, Martinez and Raydan 2000), with one
-product with C per step. Slopes of the surface are taken as small. Friction does not resist here that pressure alone
+and moves with the surface, or slips, and bears the traction mu p against its slip (Coulomb). One step of monotone
+loading: pressure first, then slide and twist together, without history. That is a convex problem: the least of
+1/2 t C t - t g over tractions with |t| <= mu p in each cell, C the pad's compliance and g the surface's movement, by
+spectral projected gradients (Birgin, Martinez and Raydan 2000). Friction does not resist here that pressure alone
 spreads the surface, and the effect of traction on pressure is left out (Goodman 1962): exact for a thick layer of nu =
 0.5, while the pressure under a wide contact on a bonded one would lean by some tens of per cent.
 """
@@ -55,10 +54,7 @@ class Cover:
         return np.maximum(spread[:size, :size], 0).astype(np.float32)
 
     def _spread(self, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the share of a pressure wave that a cloth transmits: (1 + q t) exp(-q t).
-
-        Source: Johnson 1985, Eq. 2.23, the pressure at a depth in a half-space.
-        """
+        """Return the share of a pressure wave that a cloth transmits, (1 + q t) exp(-q t): Johnson 1985, Eq. 2.23."""
         depth = q_per_mm * self.cloth_mm
         return (1 + depth) * np.exp(-depth)
 
@@ -66,11 +62,8 @@ class Cover:
 BARE: Final = Cover()
 
 _MAX_STEPS: Final = 200
+# Depth in indentations up to which cells may touch: next to a contact the pad bulges, by at most 0.39 of it.
 REACH: Final = 1.5
-"""Depth in indentations up to which cells may touch.
-
-The pad bulges next to a contact, by at most 0.39 of the indentation over the 18 surfaces.
-"""
 
 
 class ContactSolver:
@@ -81,15 +74,13 @@ class ContactSolver:
         layer: Layer,
         size: int,
         cell_mm: float,
-        dtype: torch.dtype = torch.float32,
         cover: Cover = BARE,
         sides: float = 0.0,
     ) -> None:
         self.size = size
         self.cell_mm = cell_mm
-        self._grid = PadGrid(layer, size, cell_mm, dtype, lambda q_x, q_y: cover.compliance(layer, np.hypot(q_x, q_y)))
-        self._dtype = dtype
-        self._side_give = SideGive.of(sides, layer, size, cell_mm, dtype) if sides else None
+        self._grid = PadGrid(layer, size, cell_mm, lambda q_x, q_y: cover.compliance(layer, np.hypot(q_x, q_y)))
+        self._side_give = SideGive.of(sides, layer, size, cell_mm) if sides else None
 
     @property
     def cell_compliance_mm_per_mpa(self) -> float:
@@ -98,8 +89,8 @@ class ContactSolver:
 
     def displacement_mm(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the surface displacement downwards under pressures (n, size, size), in [mm]."""
-        pressure = torch.as_tensor(pressure_mpa, dtype=self._dtype)
-        return self._respond(pressure, torch.zeros(()), self._side_give).numpy().astype(np.float32)
+        pressure = torch.as_tensor(pressure_mpa, dtype=torch.float32)
+        return self._respond(pressure, torch.zeros(()), self._side_give).numpy()
 
     def solve(
         self,
@@ -110,23 +101,18 @@ class ContactSolver:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Press surfaces into the pad, and return the pressures (n, size, size) in [MPa] and the residuals (n,).
 
-        A residual is the RMS gap where pressure acts or surfaces overlap, over the indentation.
-        For flat surfaces the solution is linear in the indentation: one solve serves all depths of a tap.
-
-        Args:
-            depth_mm: (n, size, size), depth of each cell below the point of first contact, in [mm].
-            indentation_mm: indentation of that point, one for all or (n,), > 0, in [mm].
-            tolerance: residual at which a solution is good enough.
-            covered: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
-                everywhere if None. Pressures are then means over cells.
+        Depths (n, size, size) are below the point of first contact, whose indentation is above 0, one for all or (n,).
+        `covered`, (n, size, size), is the share of each cell that the surface covers, above 0 wherever a cell is
+        reached; None for 1 everywhere. Pressures are means over cells. A residual is the RMS gap where pressure acts or
+        surfaces overlap, over the indentation.
         """
         indentation = np.broadcast_to(np.asarray(indentation_mm, dtype=np.float64), len(depth_mm))
         pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
         residual = np.zeros(len(depth_mm), dtype=np.float32)
         for poses, place in self._grid.boxes(depth_mm < REACH * indentation[:, None, None]):
-            press = torch.as_tensor(indentation[poses, None, None], dtype=self._dtype)
-            depth = torch.as_tensor(depth_mm[place], dtype=self._dtype)
-            share = torch.ones(()) if covered is None else torch.as_tensor(covered[place], dtype=self._dtype)
+            press = torch.as_tensor(indentation[poses, None, None], dtype=torch.float32)
+            depth = torch.as_tensor(depth_mm[place], dtype=torch.float32)
+            share = torch.ones(()) if covered is None else torch.as_tensor(covered[place], dtype=torch.float32)
             # The pressure on the covered share is 1 / share times the cell's mean.
             give = self.cell_compliance_mm_per_mpa * torch.where(share > 0, 1 / share - 1, 0.0)
             sides = None if self._side_give is None else self._side_give.boxes(*place[1:])
@@ -151,7 +137,7 @@ class ContactSolver:
         wanted = torch.where(reachable, press - depth, 0.0)
         pressure = wanted.clamp_min(0) / (self.cell_compliance_mm_per_mpa + give)
         give = give.expand_as(pressure)
-        result, residual = pressure.clone(), torch.zeros(len(pressure), dtype=self._dtype)
+        result, residual = pressure.clone(), torch.zeros(len(pressure))
         working = torch.arange(len(pressure))
         gap = torch.where(reachable, self._respond(pressure, give, sides) - wanted, 0.0)
         direction = torch.zeros_like(pressure)
@@ -186,7 +172,7 @@ class ContactSolver:
             # A cell without pressure that would overlap the surface returns to the contact; the search then restarts.
             returning = (pressure <= 0) & (gap < 0) & reachable
             pressure = torch.where(returning, -length.abs() * gap, pressure)
-            keep = (~returning.flatten(1).any(dim=1)).to(self._dtype)[:, None, None]
+            keep = (~returning.flatten(1).any(dim=1)).float()[:, None, None]
             # Where no cell was cut off or returned, the step was linear, and so is the gap's.
             bent = (returning | (stepped < 0)).flatten(1).any(dim=1)
             gap = torch.where(reachable, gap - length * response, 0.0)
@@ -212,14 +198,13 @@ def _rms(maps: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
     return torch.sqrt((maps**2).sum(dim=(1, 2)) / where.sum(dim=(1, 2)).clamp_min(1))
 
 
-_REMEMBERED: Final = 4
-"""Number of past energies whose largest a step may not exceed: the method does not descend at every step."""
+_REMEMBERED: Final = 4  # past energies whose largest a step may not exceed: the method does not descend at every step
 
 
 class FrictionSolver:
     """Solver of poses on a square grid over one pad, with the arguments of `train.physics.contact.ContactSolver`."""
 
-    def __init__(self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(self, layer: Layer, size: int, cell_mm: float) -> None:
         def compliance(q_x: NDArray[np.floating], q_y: NDArray[np.floating]) -> NDArray[np.float64]:
             xx, yy, xy = surface_tensor(layer, q_x, q_y)
             # The highest wave is its own mirror image, so an odd transfer is zero there.
@@ -228,12 +213,11 @@ class FrictionSolver:
 
         self.size = size
         self.cell_mm = cell_mm
-        self._dtype = dtype
-        self._grid = PadGrid(layer, size, cell_mm, dtype, compliance)
+        self._grid = PadGrid(layer, size, cell_mm, compliance)
 
     def displacement_mm(self, traction_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the surface displacement (n, 2, size, size) under tractions of that shape, in [mm]."""
-        return self._displace(torch.as_tensor(traction_mpa, dtype=self._dtype)).numpy().astype(np.float32)
+        return self._displace(torch.as_tensor(traction_mpa, dtype=torch.float32)).numpy()
 
     def solve(
         self,
@@ -245,10 +229,9 @@ class FrictionSolver:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Slide (n, 2) surfaces to the right and back, and turn them (n,) about the pad's centre from right to back.
 
-        They touch with pressures (n, size, size), where these are above 0, and have coefficients of friction mu (n,).
-        Returned are tractions on the pad to the right and back, (n, 2, size, size) in [MPa], and residuals (n,): the
-        RMS error over the contact of the movement, which should vanish where cells stick, and oppose the traction where
-        they slip, as a share of the surface's movement.
+        They touch with pressures (n, size, size) and have coefficients of friction mu (n,). Returned are tractions on
+        the pad to the right and back, (n, 2, size, size) in [MPa], and residuals (n,): the RMS over the contact of what
+        moves against Coulomb's law, as a share of the surface's movement.
         """
         count = len(pressure_mpa)
         along_mm = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
@@ -262,8 +245,8 @@ class FrictionSolver:
         residual = np.zeros(count, dtype=np.float32)
         for poses, place in self._grid.boxes(limit_mpa > 0):
             traction, error = self._projected_gradients(
-                torch.as_tensor(limit_mpa[place], dtype=self._dtype)[:, None],
-                torch.as_tensor(np.stack([part[place] for part in moved_mm], axis=1), dtype=self._dtype),
+                torch.as_tensor(limit_mpa[place], dtype=torch.float32)[:, None],
+                torch.as_tensor(np.stack([part[place] for part in moved_mm], axis=1), dtype=torch.float32),
                 tolerance,
             )
             for part, axis in zip(traction_mpa.swapaxes(0, 1), range(2), strict=True):
@@ -285,7 +268,7 @@ class FrictionSolver:
         length = _dot(wanted, wanted) / _dot(wanted, response).clamp_min(1e-30)
         traction = _project(length * wanted, limit)
         slip = torch.where(touching, self._displace(traction) - wanted, 0.0)
-        result, residual = traction.clone(), torch.zeros(len(traction), dtype=self._dtype)
+        result, residual = traction.clone(), torch.zeros(len(traction))
         working = torch.arange(len(traction))
         energies = (_dot(traction, slip - wanted) / 2).expand(-1, _REMEMBERED, 1, 1).clone()
         steps = 0

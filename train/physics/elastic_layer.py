@@ -4,9 +4,8 @@ The pad is a soft layer of thickness h on a rigid board. A pressure wave p exp(i
 material by u_z = W(q, z) p and u_x = i U(q, z) p along the wave. All formulas use decaying exponentials only, so that
 no q h overflows. Lengths in [mm], stresses in [MPa].
 
-On a grid over a pad, displacement is a convolution of the loads, done by FFT on a padded grid. Only the bounding box of
-the cells that a press can reach is computed: the kernel is the whole pad's, cut to the box, so the result is that of
-the whole pad. Presses with boxes of one shape are solved in a batch.
+On a grid over a pad, displacement is a convolution of the loads, done by FFT on a padded grid, on the bounding box of
+the cells that a press can reach alone. Presses with boxes of one shape are solved in a batch.
 
 The free sides of a pad are absent from the infinite layer: near them it is softer and bulges outwards. The effect of a
 load on a side falls with the load's distance d' from the side, and spreads along it by a bell curve. The added
@@ -34,8 +33,8 @@ class Layer:
 
     thickness_mm: float = 4.5  # h
     shear_modulus_mpa: float = 0.12  # G
-    poisson: float = 0.45  # nu, below 0.5
-    """Effective value, because a 20 mm pad is free at its sides: at 0.49 z and force would not be proportional."""
+    # nu, below 0.5; an effective value, as a 20 mm pad is free at its sides: at 0.49 z would not be as the force.
+    poisson: float = 0.45
 
     def __post_init__(self) -> None:
         if not 0 <= self.poisson < 0.5:
@@ -45,7 +44,6 @@ class Layer:
 
 
 Array = NDArray[np.float64]
-
 
 _LONGEST: Final = 1e-8  # q h below which a closed form is its limit: exact to a^2 / (1 - 2 nu)
 
@@ -103,15 +101,11 @@ def inner_displacement(layer: Layer, q_per_mm: Array, height_mm: float) -> tuple
 
 
 class TangentialResponse(NamedTuple):
-    """Displacement per tangential traction at one height, of waves of any shape, in [mm/MPa].
+    """Displacement per tangential traction at one height, of waves of any shape, in [mm/MPa]."""
 
-    `along` and `across` the wave are in the plane, under traction in that direction. i times `sunk` is the displacement
-    downwards under traction along the wave: on top, by reciprocity, -U of `inner_displacement`.
-    """
-
-    along: Array
-    across: Array
-    sunk: Array
+    along: Array  # the wave, as the traction
+    across: Array  # the wave, as the traction
+    sunk: Array  # i times this is downwards, under traction along the wave
 
 
 def inner_tangential(layer: Layer, q_per_mm: Array, height_mm: float) -> TangentialResponse:
@@ -129,8 +123,7 @@ def _inside(
 ) -> tuple[Array, Array]:
     """Return the displacement (w, u) in [mm] inside the layer: u_z = w exp(i q x), upwards, and u_x = i u exp(i q x).
 
-    Each wave solves four boundary conditions: no displacement on the board, and on top sigma_zz = normal exp(i q x) and
-    sigma_xz = shear i exp(i q x).
+    The board holds the layer; on top sigma_zz = normal exp(i q x) and sigma_xz = shear i exp(i q x).
     """
     # Longer waves differ from their limit by less than the equations of nearly equal exponentials leave.
     q = np.maximum(q_per_mm.ravel(), 1e-5 / layer.thickness_mm)
@@ -156,11 +149,7 @@ class _Waves(NamedTuple):
 
 
 def _waves(layer: Layer, q: Array, z_mm: float) -> _Waves:
-    """Return the solutions (a + b q z) exp(+-q z) of Navier's equations, scaled to similar amplitudes.
-
-    For u = (a + b q z) exp(q z) equilibrium requires w = (a - b (3-4nu) + b q z) exp(q z); for u = (a + b q z) exp(-q
-    z), it requires w = (-a - b (3-4nu) - b q z) exp(-q z).
-    """
+    """Return the solutions (a + b q z) exp(+-q z) of Navier's equations, scaled to similar amplitudes."""
     kappa = 3 - 4 * layer.poisson
     above, below = q * (z_mm - layer.thickness_mm), q * z_mm
     rising, falling = np.exp(above), np.exp(-q * z_mm)
@@ -171,8 +160,8 @@ def _waves(layer: Layer, q: Array, z_mm: float) -> _Waves:
     return _Waves(u, w, q[:, None] * slope_u, q[:, None] * slope_w)
 
 
+# Indices of boxes into maps (presses, size, size): presses (n, 1, 1), rows (n, height, 1), columns (n, 1, width).
 Place = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
-"""Indices of boxes into maps (presses, size, size): presses (n, 1, 1), rows (n, height, 1), columns (n, 1, width)."""
 
 
 class PadGrid:
@@ -186,7 +175,6 @@ class PadGrid:
         layer: Layer,
         size: int,
         cell_mm: float,
-        dtype: torch.dtype,
         compliance: Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.float64]],
     ) -> None:
         # A period of eight thicknesses limits the error of a punch's force to 5e-4; with one of twice the pad it was
@@ -194,7 +182,6 @@ class PadGrid:
         period = 2 * max(size, ceil(4 * layer.thickness_mm / cell_mm))
         self._kernels = np.fft.irfft2(compliance(*waves(period, cell_mm)), s=(period, period))
         self._size = size
-        self._dtype = dtype
         # Powers of two suit the FFT, and are few, so that many presses share one.
         self._sides = [*(side for side in (8, 16, 32, 64, 128, 256) if side < size), size]
         self._spectra: dict[tuple[int, int], torch.Tensor] = {}
@@ -208,7 +195,7 @@ class PadGrid:
         """Return the kernels' spectra (..., 2 height, width + 1) on a box, which symmetry makes real."""
         if (height, width) not in self._spectra:
             rows, columns = (np.fft.ifftshift(np.arange(-side, side)) for side in (height, width))
-            kernels = torch.as_tensor(self._kernels[..., rows[:, None], columns], dtype=self._dtype)
+            kernels = torch.as_tensor(self._kernels[..., rows[:, None], columns], dtype=torch.float32)
             self._spectra[height, width] = torch.fft.rfft2(kernels).real
         return self._spectra[height, width]
 
@@ -272,7 +259,7 @@ def side_movement(
 
 
 class SideGive:
-    """Compliance that free sides add on boxes of a grid: a few small matrix products in a step of the contact solver.
+    """Compliance that free sides add on boxes of a grid.
 
     A force at (x', y') adds across(x) across(x') along(y, y') to the displacement at (x, y), for each side and term.
     Profiles across are (n, terms, 2, width) and (n, terms, 2, height) at the boxes' columns and rows, lower side first,
@@ -284,13 +271,13 @@ class SideGive:
         self._along = along
 
     @classmethod
-    def of(cls, amplitude: float, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype) -> "SideGive":
+    def of(cls, amplitude: float, layer: Layer, size: int, cell_mm: float) -> "SideGive":
         """Return the compliance of the whole grid."""
         cells_mm, thickness_mm = (np.arange(size) - (size - 1) / 2) * cell_mm, layer.thickness_mm
         scale, apart_mm = amplitude / (layer.shear_modulus_mpa * thickness_mm), cells_mm[:, None] - cells_mm
         across = np.stack([_fall(cells_mm, reach * thickness_mm) for _, reach, _ in _GIVES])
         along = np.stack([scale * factor * _bell(apart_mm, spread * thickness_mm) for factor, _, spread in _GIVES])
-        falls, bells = torch.as_tensor(across[None], dtype=dtype), torch.as_tensor(along * cell_mm**2, dtype=dtype)
+        falls, bells = (torch.as_tensor(part, dtype=torch.float32) for part in (across[None], along * cell_mm**2))
         return cls((falls, falls), (bells, bells))
 
     def boxes(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> "SideGive":

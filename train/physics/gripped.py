@@ -25,8 +25,7 @@ FINE_SCALE: Final = 20  # pattern pixels per pitch at which truth is computed
 SAMPLES: Final = 4  # places along a cell's side at which a shape is sampled
 MOST_FORCE_N: Final = 40.0  # largest force on the pad, in [N]
 SCALE: Final = 10
-TRACTION_SCALE: Final = 2
-"""Traction pixels per taxel pitch: the layer passes 3 % of a wave of two such pixels, so finer is not measurable."""
+TRACTION_SCALE: Final = 2  # traction pixels per pitch: the layer passes 3 % of a wave of two such pixels
 _CELLS_PER_PITCH: Final = 10
 _MOST_TRIES: Final = 6
 
@@ -65,11 +64,7 @@ def between_frames(frames: NDArray[np.float32], share: NDArray[np.floating]) -> 
 
 
 class GrippedPad:
-    """One pad, and presses onto it.
-
-    Attributes:
-        places_mm: x (1, m) and y (m, 1) on the pad at which shapes are sampled, in [mm].
-    """
+    """One pad, and presses onto it."""
 
     def __init__(self, pad: Pad) -> None:
         self.pad = pad
@@ -85,6 +80,7 @@ class GrippedPad:
         self._friction = FrictionSolver(pad.layer, self.size, self.cell_mm)
         self.skin = Skin(pad, self.size, self.cell_mm)
         across = ((np.arange(self.size * SAMPLES) + 0.5) / SAMPLES - self.size / 2) * self.cell_mm
+        # x (1, m) and y (m, 1) on the pad at which shapes are sampled.
         self.places_mm = (across[None, :].astype(np.float32), across[:, None].astype(np.float32))
         self._uneven_mm = pad.uneven(*self.places_mm)
 
@@ -98,18 +94,11 @@ class GrippedPad:
         covers: Sequence[Cover],
         scale: int = SCALE,
     ) -> Presses:
-        """Press shapes onto the pad; a press that would exceed MOST_FORCE_N is made less deep.
+        """Press shapes onto the pad, where none exceeds MOST_FORCE_N; SurfaceError if nothing lies under the pad.
 
-        SurfaceError if nothing lies under the pad.
-
-        Args:
-            heights_mm: (n, m, m) at `places_mm`, in [mm]; higher parts touch the pad first.
-            indentation_mm: (n,), of the highest part from first contact, above 0 to MAX_INDENTATION_MM.
-            slide_mm: (n, 2), movement of the shape to the right and down the rows after contact, in [mm].
-            twist_rad: (n,), turn about the pad's centre from x towards y.
-            friction: (n,), Coulomb's coefficient.
-            covers: one for each press.
-            scale: pattern pixels per taxel pitch.
+        Heights (n, m, m) are at `places_mm`, indentations (n,) of the highest part from first contact, above 0 to
+        MAX_INDENTATION_MM. Then the shapes slide (n, 2) to the right and down the rows, and turn (n,) about the pad's
+        centre from x towards y, with Coulomb's friction (n,). `scale` is pattern pixels per taxel pitch.
         """
         depth_mm, cells_mm, share = self._under(heights_mm)
         depth = np.array(indentation_mm, dtype=np.float64)
@@ -138,8 +127,8 @@ class GrippedPad:
     def tap(self, heights_mm: NDArray[np.float32], force_n: float) -> Taps:
         """Press flat figures straight down until the set force or MAX_INDENTATION_MM, whichever comes first.
 
-        Heights (n, m, m) are as in `press`; the pad does not reach the plate under a figure. The pressure is then in
-        proportion to the indentation: one solution serves all frames of a tap.
+        Heights are as in `press`; the pad does not reach the plate under a figure. The pressure is then in proportion
+        to the indentation: one solution serves all frames of a tap.
         """
         depth_mm, cells_mm, share = self._under(heights_mm)
         most_mm = np.full(len(heights_mm), MAX_INDENTATION_MM)
@@ -165,10 +154,7 @@ class GrippedPad:
     def _under(
         self, heights_mm: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return depths below the highest part at the places and in the cells, and the cells' carrying shares.
-
-        SurfaceError if nothing lies under the pad.
-        """
+        """Return depths below the highest part at the places and in the cells, and the cells' carrying shares."""
         if self._beside.any():
             heights_mm = np.where(self._beside, np.float32(-NOTHING_MM), heights_mm)
         if not (heights_mm.max(axis=(1, 2)) > -100).all():
@@ -215,9 +201,7 @@ class GrippedPad:
         """Return patterns and contact areas at FINE_SCALE, which is pixels of half a cell.
 
         A cell's own deflection under its pressure on the shape, less its gap, is positive inside a contact and negative
-        outside; the contact's edge is where it passes through zero between the cells' centres. In contact with a rigid
-        shape the pad follows the shape; under a soft one its place follows from its own layer's deflection by the
-        pressure on the pad.
+        outside. In contact with a rigid shape the pad follows the shape, under a soft one its own layer's deflection.
         """
         pixels = 2 * self._pattern_cells
         rim = self.size - self._pattern_cells
@@ -261,10 +245,7 @@ class GrippedPad:
 
 
 def _carrying(depth_mm: NDArray[np.floating], cells: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the depth of each cell's carrying part, and its share of the cell, both (n, cells, cells).
-
-    Depths (n, m, m) are below the highest part; m is a multiple of `cells`, which is their number along a side.
-    """
+    """Return the depth of each cell's carrying part, and its share of the cell, (n, cells, cells), of (n, m, m)."""
     samples = depth_mm.shape[1] // cells
     parts = depth_mm.reshape(len(depth_mm), cells, samples, cells, samples)
     # A part 0.1 mm below a cell's highest one carries no load.

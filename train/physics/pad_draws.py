@@ -14,14 +14,11 @@ from train.physics.magnets import Magnet
 NEWTONS_PER_COUNT_Z: Final = 0.00085  # by the data sheet, for the sum of z
 
 _UNEVEN_WAVES: Final = 8
+# Standard deviations of one magnet's lean, of its height about the pad's, and of its moment as a share of the nominal
+# one. The latter two make a gain of 0.04, and with the chips' 0.075 the 15 % either way that is seen on devices.
 _TILT_RAD: Final = 0.05
-"""Standard deviation of a magnet's lean: three degrees, for a part of a millimetre placed by a machine."""
 _SEAT_MM: Final = 0.02
-"""Standard deviation of one magnet's height about the pad's, in [mm].
-
-With the moment it makes a gain of 0.04, and with the chips' 0.075 the 15 % either way that is seen on devices.
-"""
-_MOMENT: Final = 0.015  # standard deviation of one magnet's moment, relative to the nominal one, within one batch
+_MOMENT: Final = 0.015
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,9 +28,9 @@ class Pad:
     thickness_mm: float = 4.5
     shear_modulus_mpa: float = 0.12
     poisson: float = 0.45
+    # Factor on the in-plane movement that pressure alone gives the magnets, which in reality friction holds: grips have
+    # an in-plane to normal ratio of 0.18 to 0.26, without the factor it would be 0.57.
     in_plane_share: float = 0.4
-    """Factor on the in-plane movement that pressure alone gives the magnets, which in reality friction holds: grips
-    have an in-plane to normal ratio of 0.18 to 0.26, without the factor it would be 0.57."""
     magnet_height_mm: float = 2.5
     counts_per_newton: float = 1 / NEWTONS_PER_COUNT_Z  # summed z under an even load
     pitch_mm: float = USPA44.pitch_mm  # of another model in proportion to its own
@@ -93,6 +90,7 @@ class Pad:
 
 NOMINAL: Final = Pad()  # pad of the first frozen set
 
+# Bounds of the constants that are drawn uniformly; docs/train.md has the reason for each.
 RANGES: Final[dict[str, tuple[float, float]]] = {
     "thickness_mm": (3.6, 5.4),
     "shear_modulus_mpa": (0.09, 0.15),
@@ -103,20 +101,16 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
     "pitch_mm": (4.6, 5.0),
     "free_sides": (0.0, 0.6),
 }
-"""Bounds of the constants that are drawn uniformly; docs/train.md has the reason for each."""
 
+# Bounds of constants of pads that can be simulated: magnets stay within the layer, and above their chips.
 SIMULATED: Final = {name: (max(2 * least - most, 0.0), 2 * most - least) for name, (least, most) in RANGES.items()} | {
     "thickness_mm": (3.1, 7.2),
     "poisson": (0.31, 0.4999),
     "magnet_height_mm": (2.0, 3.0),
 }
-"""Bounds of constants of pads that can be simulated: magnets stay within the layer, and above their chips."""
 
-INPUTS: Final = tuple(RANGES)[:6]
-"""Constants that a network takes as optional inputs: all but the pitch and the free sides."""
-
-KNOWN: Final = 2 * len(INPUTS) + 1
-"""Number of pad inputs of a network: values, a flag for each of them, and the certainty of the gains."""
+INPUTS: Final = tuple(RANGES)[:6]  # that a network takes if they are known: all but the pitch and the free sides
+KNOWN: Final = 2 * len(INPUTS) + 1  # inputs of a network: values, a flag for each, and the certainty of the gains
 
 
 def draw_pad(rng: np.random.Generator, spread: float = 1.0, ranges: Mapping[str, tuple[float, float]] = RANGES) -> Pad:

@@ -1,8 +1,7 @@
 """Nuisances that real sensors add to the physics: named, seeded with independent streams, each can be switched off.
 
-The order is that of the signal's path. The pad lags (hysteresis), neighbours are visible (cross-talk, a field, which
-the chip amplifies with the rest), the chip has its gain; a warming pad and the earth's field add to it; then noise, the
-end of the range, dead taxels, and rounding to whole counts.
+The order is that of the signal's path: the pad lags (hysteresis), neighbours are visible (cross-talk), the chip has its
+gain; a warming pad and the earth's field add to it; then noise, the end of the range, dead taxels, whole counts.
 
 Of the lag: with c the elastic reading, a reading is (1 - share) c + share q with dq/dt = (c - q) / relaxation_s: the
 standard linear solid, a spring parallel to one Maxwell element.
@@ -23,8 +22,7 @@ from train.surfaces.depth_image import Pose
 
 Seed = int | Sequence[int]
 
-LARGEST_COUNTS: Final = (1400.0, 1400.0, 13500.0)
-"""Largest readings: the data sheet's range of x and y, and z observed in a grasp."""
+LARGEST_COUNTS: Final = (1400.0, 1400.0, 13500.0)  # the data sheet's range of x and y, and z observed in a grasp
 TAP_S: Final = (0.2, 2.5)  # bounds of a press' duration, in [s]: a fast robot, and the press of the paper's Fig. 15.
 
 
@@ -32,35 +30,24 @@ TAP_S: Final = (0.2, 2.5)  # bounds of a press' duration, in [s]: a fast robot, 
 class Nuisances:
     """Strength of each nuisance, with defaults observed on devices in the field; 0 is off, for saturation infinity.
 
-    Spreads are cut at two standard deviations. One sensor reads all taps of a window.
-
-    Attributes:
-        pose_error_mm: standard deviation of a tap's x and y, for a hand-mounted gripper; the paper's robot has 0.03 mm.
-        pose_error_deg: the same of its angle.
-        hysteresis: largest share of a reading that lags, per sensor from 0.01: data sheet 1.1 %, in the field to 11 %.
-        cross_talk: largest share of a reading that shows in its four neighbours in addition to that of the nominal
-            magnets, per sensor: 5 % corresponds to half a millimetre of magnet height, by the dipole's law.
-        gain_spread: standard deviation of a chip axis' gain about 1, per sensor: +-15 % observed.
-        thermal_drift_counts: standard deviation of z's drift since the last zeroing; x and y an eighth of it; common
-            to all taxels but for a quarter. A drift of 94 reads as a contact, and two deviations stay below it: users
-            who zero again after warming up (120 counts per 3.5 K) see no more.
-        earth_field_counts: length of the earth's field, which is constant in space while the pad turns; zeroed at
-            another attitude. The rests of one sensor differed by 25 counts in two attitudes, sqrt(2) times the field.
-        noise_counts: standard deviation of a reading at rest: 1.7 to 2.6 measured.
-        saturation_counts: largest |reading| of x, y, z.
-        dead_taxels: probability that a taxel always reads its rest level, per sensor: about 5 %.
+    Spreads are standard deviations, cut at two of them. One sensor reads all taps of a window.
     """
 
-    pose_error_mm: float = 0.2
+    pose_error_mm: float = 0.2  # of a tap's x and y, for a hand-mounted gripper; the paper's robot has 0.03 mm
     pose_error_deg: float = 1.0
-    hysteresis: float = 0.11
+    hysteresis: float = 0.11  # largest share of a reading that lags, from 0.01: data sheet 1.1 %, in the field to 11 %
+    # Largest share of a reading that shows in its four neighbours beyond that of the nominal magnets: 5 % corresponds
+    # to half a millimetre of magnet height, by the dipole's law.
     cross_talk: float = 0.05
-    gain_spread: float = GAIN_SPREAD
+    gain_spread: float = GAIN_SPREAD  # of a chip axis' gain about 1: +-15 % observed
+    # Of z since the last zeroing; x and y an eighth of it; common to all taxels but for a quarter. A drift of 94 reads
+    # as a contact: users who zero again after warming up (120 counts per 3.5 K) see no more than two deviations.
     thermal_drift_counts: float = 45.0
+    # Length of the earth's field, zeroed at another attitude: the rests of one sensor differed by 25 counts in two.
     earth_field_counts: float = 18.0
-    noise_counts: float = 2.0
+    noise_counts: float = 2.0  # at rest: 1.7 to 2.6 measured
     saturation_counts: tuple[float, float, float] = LARGEST_COUNTS
-    dead_taxels: float = 0.0
+    dead_taxels: float = 0.0  # probability that a taxel always reads its rest level: about 5 %
 
     def without(self, *names: str) -> Self:
         """Return these nuisances with the named ones off."""
@@ -80,13 +67,9 @@ def apply_nuisances(
 ) -> NDArray[np.float32]:
     """Return the readings of n sensors in their K taps, (n, K, F, 3, rows, cols) in whole zeroed counts.
 
-    Args:
-        clean: (n, K, F, 3, rows, cols) zeroed counts, newest tap first; frames evenly spaced in time, the first one
-            a step after the pad was free.
-        nuisances: of these sensors.
-        seed: every nuisance draws from an independent stream of it, so switching one off changes no other.
-        tap_s: durations, broadcast to (n, K), above 0, in [s]; None draws them between the bounds of TAP_S.
-        angle_deg: the pad's turn in each tap, broadcast to (n, K), in [deg], as in train.surfaces.depth_image.Pose.
+    Those without nuisances are alike, newest tap first; frames are evenly spaced in time, the first one a step after
+    the pad was free. Durations and turns of the pad are broadcast to (n, K); without `tap_s` durations are drawn. Every
+    nuisance draws from a stream of its own, so switching one off changes no other.
     """
     n, taps, frames, *scan = clean.shape
 
@@ -142,10 +125,7 @@ def _draw_drift(rng: np.random.Generator, n: int, scan: Sequence[int]) -> NDArra
 
 
 def _draw_earth(rng: np.random.Generator, turn: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the change of a field of length 1 since zeroing at any attitude, (n, K, 3) in the pad's axes.
-
-    The pad's turn in each tap is `turn`, in [rad].
-    """
+    """Return the change of a field of length 1 since zeroing at any attitude, (n, K, 3) in the axes of turned pads."""
     field, zeroed = rng.standard_normal((2, len(turn), 3))
     field /= np.linalg.norm(field, axis=-1, keepdims=True)
     zeroed /= np.linalg.norm(zeroed, axis=-1, keepdims=True)

@@ -27,16 +27,11 @@ _SLOPE_STEP_MM: Final = 1e-3
 _EVEN, _ODD = 0, 1
 
 _Array = NDArray[np.float64]
-_Transfer = tuple[int, int, _Array]
-"""Parity in x and in y, even or odd, and the amplitudes (q_y, q_x) of a transfer's quarter of waves."""
+_Transfer = tuple[int, int, _Array]  # parity in x and in y, and the amplitudes (q_y, q_x) of its quarter of waves
 
 
 class Skin:
-    """Readings of a sensor whose pad is pressed, by loads on a grid of `size` cells a side of `cell_mm`.
-
-    Attributes:
-        counts_per_mt: of every chip and axis.
-    """
+    """Readings of a sensor whose pad is pressed, by loads on a grid of `size` cells a side of `cell_mm`."""
 
     def __init__(self, pad: Pad, size: int, cell_mm: float) -> None:
         geometry, layer, magnet = pad.geometry(), pad.layer, pad.magnet
@@ -64,10 +59,7 @@ class Skin:
     def movement(
         self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
     ) -> NDArray[np.floating]:
-        """Return the MOVEMENT of the magnets, (..., taxels, 5), under loads on the pad.
-
-        Pressure is (..., size, size), traction (..., 2, size, size) to the right and back.
-        """
+        """Return the MOVEMENT (..., taxels, 5) by pressures (..., size, size) and tractions (..., 2, size, size)."""
         taxels, parts, cells = self._response.shape
         moved = pressure_mpa.reshape(-1, cells) @ self._response.reshape(-1, cells).T
         if traction_mpa is not None:
@@ -156,8 +148,7 @@ def _per_wave(part: _Array, q: _Array) -> _Array:
 def _sums(geometry: SensorGeometry, size: int, cell_mm: float, transfers: list[_Transfer]) -> _Array:
     """Return responses (taxels, transfers, cells) of the magnets to the cells.
 
-    A transfer is even or odd in each axis, so that a quarter of its waves, with real sines and cosines, is enough: a
-    tenth of the products of whole complex waves.
+    A transfer is even or odd in each axis, so that a quarter of its waves, with real sines and cosines, is enough.
     """
     q = _quarter(size, cell_mm)[0][0]
     # All waves but the first and the last of an axis stand for two, of q and of -q.

@@ -16,11 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-BETA_MM: Final = 1.3
-"""Reach with the best fit to the default layer's surface: 2.6 % of the indentation over the 18 surfaces, see tests."""
+BETA_MM: Final = 1.3  # best fit to the default layer's surface: 2.6 % of the indentation over the 18 surfaces
 PLANES: Final = 4  # largest number of planes; twice as many change the error by less than 0.1 % of the indentation
-EDGE_BETA_MM: Final = 0.6
-"""Reach of a plane that just touches, fitted to the default layer under spheres and cylinders, see tests."""
+EDGE_BETA_MM: Final = 0.6  # of a plane that just touches, fitted to the default layer under spheres and cylinders
 
 
 def tpsf_pattern(
@@ -28,8 +26,7 @@ def tpsf_pattern(
 ) -> NDArray[np.float32]:
     """Return the surface deformation of flat contacts, (n, H, W) in [mm], of areas (n, H, W) and indentations (n,).
 
-    The kernel's intensity alpha follows from the rigid flat contact: in it, the pad is pressed in by the indentation,
-    so the plateau equals it. Its reach is beta.
+    Alpha follows from the rigid flat contact: there the pad is pressed in by the indentation, which is the plateau.
     """
     area = torch.from_numpy(np.ascontiguousarray(touching))
     response = spread(area.float(), torch.tensor([beta_mm], dtype=torch.float32), pixel_mm)
@@ -74,10 +71,7 @@ def heights_pattern(
 
 
 def spread(maps: Tensor, beta_mm: Tensor, pixel_mm: float) -> Tensor:
-    """Convolve maps (n, H, W) with exp(-r^2/beta^2), beta (n,) or (1,), zero outside the map; their unit times [mm^2].
-
-    The Gaussian is a product of two curves, and takes two products of matrices.
-    """
+    """Convolve maps (n, H, W), zero outside, with exp(-r^2/beta^2), beta (n,) or (1,); in their unit times [mm^2]."""
     height, width = maps.shape[1:]
     down = _curve(height, beta_mm, pixel_mm)
     right = down if width == height else _curve(width, beta_mm, pixel_mm)
@@ -85,7 +79,7 @@ def spread(maps: Tensor, beta_mm: Tensor, pixel_mm: float) -> Tensor:
 
 
 def _curve(length: int, beta_mm: Tensor, pixel_mm: float) -> Tensor:
-    """Return one factor of the Gaussian, between any two pixels of a line: (n, length, length)."""
+    """Return the Gaussian's factor along one axis, between any two pixels of a line: (n, length, length)."""
     place_mm = torch.arange(length, dtype=beta_mm.dtype, device=beta_mm.device) * pixel_mm
     distance_mm = place_mm[:, None] - place_mm[None, :]
     return torch.exp(-((distance_mm / beta_mm[:, None, None]) ** 2))
