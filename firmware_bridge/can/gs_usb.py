@@ -97,10 +97,7 @@ class BitTiming(NamedTuple):
 
 
 def bit_timing(limits: BitTimingLimits) -> BitTiming:
-    """Return the timing for 1 Mbit/s of the finest quanta that allow a usual sample point, 87.5 % or a little less.
-
-    It raises ValueError if this controller cannot do it.
-    """
+    """Return the timing for 1 Mbit/s of the finest quanta that allow a usual sample point, or raise a ValueError."""
     clocks, rest = divmod(limits.clock_hz, BITRATE_BIT_S)
     for brp in range(max(limits.brp_min, 1), min(limits.brp_max, clocks) + 1, max(limits.brp_inc, 1)):
         quanta, uneven = divmod(clocks, brp)
@@ -134,19 +131,12 @@ def encode_frame(frame: CanFrame, echo_id: int) -> bytes:
 
 
 class HostFrame(NamedTuple):
-    """Frame received from the adapter: one from the bus, or an error frame.
+    """Frame received from the adapter: one from the bus, or an error frame."""
 
-    Attributes:
-        frame: the frame as it was on the bus; only the data of an error frame have a meaning.
-        error: the error classes of an error frame, None for a frame from the bus.
-        stamp_us: time by the adapter's clock, which wraps round after 32 bits, in [us]; None if it has no clock.
-        overflow: True where frames before this one were lost, since the adapter's queue was full.
-    """
-
-    frame: CanFrame
-    error: int | None
-    stamp_us: int | None
-    overflow: bool
+    frame: CanFrame  # as it was on the bus; only the data of an error frame have a meaning
+    error: int | None  # error classes of an error frame, None for a frame from the bus
+    stamp_us: int | None  # time by the adapter's clock, which wraps round after 32 bits, in [us]
+    overflow: bool  # True where frames before this one were lost, since the adapter's queue was full
 
 
 class GsUsbDecoder:

@@ -24,12 +24,10 @@ class CanNetwork(NamedTuple):
 
     @property
     def problem(self) -> str | None:
-        """Message that the network is down, with the command that brings it up; None if it is up.
-
-        It sets restart-ms, since the kernel otherwise leaves a controller in bus-off.
-        """
+        """Message that the network is down, with the command that brings it up; None if it is up."""
         if self.up:
             return None
+        # Without restart-ms the kernel leaves a controller in bus-off.
         how = f" type can bitrate {BITRATE_BIT_S} restart-ms 100" if self.driver else ""
         return f"is down: sudo ip link set {as_typed(self.name)} up{how}"
 

@@ -46,13 +46,8 @@ def open_sources(
     """Create the links that `texts` name, not yet entered; without any, that of the only known adapter.
 
     Each text is one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4", also in `mountings`. Among several
-    sources, those without a name are called by their place, source1 and so on. `rate_hz` is that at which recordings
-    are played, among them the demo's; a device has its own. Recordings of edge-sr are in place already.
-
-    Raises:
-        SourceError: no such form, or one name twice.
-        NoDeviceError: no adapter, or several without a choice.
-        RecordingError: a recording that cannot be used.
+    sources, those without a name are called by their place, source1 and so on. `rate_hz` is that of recordings.
+    Raises SourceError, NoDeviceError (or several without a choice), and RecordingError.
     """
     links: dict[str, Link] = {}
     for number, text in enumerate(texts or [None], 1):
@@ -118,10 +113,9 @@ def recording_paths(text: str) -> list[str]:
 
 
 def place_recordings(link: "ReplayLink", mountings: Mapping[str, Mounting]) -> None:
-    """Let a link put all taxels of its recordings in place: those of a CSV are as wired.
+    """Let a link put all taxels of its recordings in place: those of a CSV are as wired, and others in place already.
 
-    Raises:
-        SourceError: a CSV is of a pad with another number of taxels than its mounting.
+    Raises SourceError where a CSV is of a pad with another number of taxels than its mounting.
     """
     raw = {
         track.sensor: (recording.path, track)

@@ -77,10 +77,9 @@ class PortReader:
         termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
 
     def read(self, timeout_s: float, wanted_bytes: int) -> Piece:
-        """Return the bytes received, once `wanted_bytes` have come, or no more; waits at most `timeout_s` for any.
+        """Return the bytes received, once `wanted_bytes` have come, or no more; wait at most `timeout_s` for any.
 
-        Raises:
-            OSError: the port is gone, and all earlier bytes have been returned.
+        Raises OSError once the port is gone, and all earlier bytes have been returned.
         """
         now_ns = self._clock_ns()
         end_ns = now_ns + round(timeout_s * 1e9)
@@ -125,32 +124,19 @@ class PortReader:
 class SlcanSerialLink(Link):
     """Link to a sensor on an slcan adapter.
 
-    Opening sends close, bitrate, time stamps on and open, and waits for no acknowledgement, since some
-    adapters never send one. What arrives before the line falls silent is older than the opening and dropped.
-    Closing sends close and time stamps off: some adapters keep that setting, and not every program expects stamps.
-    They keep it in an EEPROM, which wears, so a bus that stays silent is not asked for stamps at every opening.
-
-    It may be opened any number of times. An adapter with a USB serial number is then recognised under any
-    name of its port.
-
-    Attributes:
-        port: path of the serial port.
-        baudrate: speed of the serial line, in [bit/s]; USB-CDC adapters ignore it.
+    Opening waits for no acknowledgement, since some adapters never send one; what arrives before the line falls silent
+    is older than the opening and dropped. Closing switches time stamps off: some adapters keep that setting, and not
+    every program expects stamps. They keep it in an EEPROM, which wears, so a bus that stays silent is not asked for
+    stamps at every opening.
     """
 
-    def __init__(
-        self,
-        port: str,
-        baudrate: int = DEFAULT_BAUD,
-        *,
-        model: ModelMap = USPA44_MAP,
-    ) -> None:
+    def __init__(self, port: str, baudrate: int = DEFAULT_BAUD, *, model: ModelMap = USPA44_MAP) -> None:
         """Prepare a link; nothing is opened yet."""
         self.name = f"slcan:{port}"
         # No hardware sensor is a pseudo-terminal, so a device on one is emulated.
         self.kind: SourceKind = "emulated" if Path(port).resolve().is_relative_to("/dev/pts") else "device"
         self.port = port
-        self.baudrate = baudrate
+        self.baudrate = baudrate  # speed of the serial line, in [bit/s]; USB-CDC adapters ignore it
         self._triggers = model.triggers
         self._plugged = PluggedAdapter(port)
         # Two sensors at 100 scans a second take 832 kbit/s with stamps, and 704 without.
@@ -224,11 +210,7 @@ class SlcanSerialLink(Link):
         return scans
 
     def _ask_in_silence(self, port: serial.Serial, now_ns: int) -> None:
-        """Request the status flags where no scan comes, which they may explain: of any bus they hold an error at times.
-
-        They are not requested while scans come: some adapters obey one command a USB packet, and the answer arrives
-        among the frames.
-        """
+        """Request the status flags, which may explain that no scan comes: of any bus they hold an error at times."""
         decoder, asked_ns = self._scans.decoder, self._asked_ns
         if now_ns - self._scan_ns >= ADAPTER_ASKED_NS and (asked_ns is None or now_ns - asked_ns >= ASKED_AGAIN_NS):
             self._asked_ns = now_ns

@@ -10,16 +10,11 @@ from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 
 class FrameScans:
-    """Stages from frames to scans, over any number of openings.
-
-    Attributes:
-        clock: the adapter's clock.
-        errors: what the adapter reported of its bus.
-    """
+    """Stages from frames to scans, over any number of openings."""
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
-        self.clock = DeviceClock(1_000, None)
-        self.errors = BusErrors()
+        self.clock = DeviceClock(1_000, None)  # the adapter's clock
+        self.errors = BusErrors()  # what the adapter reported of its bus
         self._assembler = ScanAssembler(model)
 
     @property

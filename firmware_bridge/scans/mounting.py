@@ -22,23 +22,11 @@ AS_MAPPED: Final = tuple(range(USPA44.taxel_count))  # default order of the defa
 
 @dataclass(frozen=True)
 class Mounting:
-    """Mounting of one sensor; by default that of its id map.
+    """Mounting of one sensor; by default that of its id map. Invalid values raise a ValueError."""
 
-    An order that is left out or empty is that of the id map.
-
-    Attributes:
-        order: for each place on the pad, row-major from the top left, the taxel of the id map that lies there.
-        swap_xy: True where the wire's x is the pad's y, and the other way round.
-        signs: 1 or -1 for x (to the right), y (down) and z (into the pad), after the swap.
-        taxel_count: number of taxels of the sensor.
-
-    Raises:
-        ValueError: one of these is invalid.
-    """
-
-    order: tuple[int, ...] = ()
-    swap_xy: bool = False
-    signs: tuple[int, int, int] = (1, 1, 1)
+    order: tuple[int, ...] = ()  # for each place, row-major from the top left, the id map's taxel there
+    swap_xy: bool = False  # True where the wire's x is the pad's y, and the other way round
+    signs: tuple[int, int, int] = (1, 1, 1)  # 1 or -1 for x (to the right), y (down), z (into the pad), after the swap
     taxel_count: int = USPA44.taxel_count
 
     def __post_init__(self) -> None:
@@ -70,10 +58,7 @@ class Mounting:
         return counts.reshape(*counts.shape[:-2], -1)[..., list(self.order)].reshape(counts.shape)
 
     def place(self, scan: Scan) -> Scan:
-        """Reorder a scan from the order of the id map to the places on the pad, the vendor's readings included.
-
-        Counts stay along the wire's axes; the vendor's newtons are turned to the pad's, still by its own calibration.
-        """
+        """Reorder a scan from the order of the id map to the places on the pad, and turn the vendor's newtons."""
         shape = scan.fresh.shape
         order = list(self.order)
         counts = self.place_counts(scan.counts)
@@ -110,10 +95,7 @@ class Mounting:
 
 
 def placed_map(model: ModelMap, mountings: Mapping[str, Mounting], prefix: str = "") -> ModelMap:
-    """Return the map of sensors as they are wired with taxels at their places on the pad; it sorts every scan anyway.
-
-    Names of sensors begin with `prefix`, and `mountings` are by these; a sensor without one keeps the order of the map.
-    """
+    """Return an id map with taxels at their places on the pad; `mountings` are by names of sensors with `prefix`."""
     place_of = {
         sensor: {taxel: place for place, taxel in enumerate(mounting.order)}
         for sensor, mounting in mountings.items()

@@ -19,15 +19,10 @@ _LAYOUTS: Final = {PACKED_BYTES: ("HxHHHx", 4), STAMPED_BYTES: ("HxHHHxH", 5)}
 
 
 class SlcanScans:
-    """Stages from slcan text to scans.
-
-    Attributes:
-        decoder: the first stage, with its counters and the status that the adapter reported.
-        clock: the adapter's clock since the last opening.
-    """
+    """Stages from slcan text to scans."""
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
-        self.decoder = SlcanDecoder()
+        self.decoder = SlcanDecoder()  # the first stage, with its counters and the status that the adapter reported
         self._assembler = ScanAssembler(model)
         self._fed_ns = 0
         self._begin_clock()
@@ -75,7 +70,7 @@ class SlcanScans:
         return self.decoder.counters() | self._assembler.counters()
 
     def _begin_clock(self) -> None:
-        self.clock = DeviceClock(tick_ns=_MS_NS, wrap_ticks=_WRAP_MS)
+        self.clock = DeviceClock(tick_ns=_MS_NS, wrap_ticks=_WRAP_MS)  # the adapter's clock since the last opening
         self._newest: tuple[int, DeviceTime] | None = None
 
     def _feed(self, readings: Readings, stamps_ms: Sequence[int], time_ns: int) -> list[Scan]:

@@ -32,30 +32,22 @@ STEP_COUNTS: Final = 15.0
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """Drift since zeroing: of all taxels on x, y, z, the most of a taxel beyond it, and the largest signed step.
+    """Drift since zeroing; all but the step is subtracted from readings."""
 
-    The step in rest level, 0 without one, stays in the readings; the others are subtracted from them.
-    """
-
-    common_counts: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    own_counts: float = 0.0
-    step_counts: float = 0.0
+    common_counts: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of all taxels on x, y, z
+    own_counts: float = 0.0  # the most of a taxel beyond it
+    step_counts: float = 0.0  # largest signed step in rest level, 0 without one
 
 
 class DriftTracker:
-    """Tracker of the rest level of one sensor.
-
-    Attributes:
-        counts: (3, rows, cols) float32, to be added to the baseline; a new array whenever it changes.
-        summary: the same in a few numbers, with the step that stays in the readings.
-        note: message to the user while a step lasts, with the figures from its beginning.
-    """
+    """Tracker of the rest level of one sensor."""
 
     def __init__(self, baseline: Baseline) -> None:
         """Start with an unmoved baseline; drift is followed once the pad has been at rest for a while."""
+        # (3, rows, cols), to be added to the baseline; a new array whenever it changes.
         self.counts: NDArray[np.float32] = np.zeros_like(baseline.counts)
-        self.summary = Drift()
-        self.note: str | None = None
+        self.summary = Drift()  # the same, with the step that stays in the readings
+        self.note: str | None = None  # message to the user while a step lasts
         self._baseline = baseline
         self._unzeroed = np.isnan(baseline.counts).any(axis=0)
         self._dead: NDArray[np.bool_] | None = None
@@ -71,8 +63,8 @@ class DriftTracker:
     def push(self, scan: Scan, contact: bool, dead: NDArray[np.bool_]) -> bool:
         """Process the next scan; return True if `counts`, `summary` or `note` have changed, or there is an event.
 
-        There is `contact` during a tap, and while the baseline is in doubt. The `dead` taxels (rows, cols) are ignored,
-        and are a new array only where they have changed.
+        There is `contact` during a tap, and while the baseline is in doubt. `dead` (rows, cols) is a new array only
+        where it has changed.
         """
         time_ns = scan.time_ns
         since_ns, self._last_ns = time_ns - self._last_ns, time_ns

@@ -36,23 +36,15 @@ class StalledError(Exception):
 
 
 class GsUsbAdapter:
-    """Adapter from one plugging-in to the next. Its methods may be called from any thread.
-
-    Attributes:
-        started: true while its channel is on the bus.
-        right_bitrate: true where its timing makes 1 Mbit/s.
-        sent: frames that it put on the bus for the client.
-        lost_frames: frames that had no room.
-        mute: true once it sends no more.
-    """
+    """Adapter from one plugging-in to the next. Its methods may be called from any thread."""
 
     def __init__(self, limits: BitTimingLimits = CANDLELIGHT) -> None:
         """Plug it in."""
-        self.started = False
-        self.right_bitrate = False
-        self.sent: list[CanFrame] = []
-        self.lost_frames = 0
-        self.mute = False
+        self.started = False  # true while its channel is on the bus
+        self.right_bitrate = False  # true where its timing makes 1 Mbit/s
+        self.sent: list[CanFrame] = []  # frames that it put on the bus for the client
+        self.lost_frames = 0  # frames that had no room
+        self.mute = False  # true once it sends no more
         self._limits = limits
         self._stamped = False
         self._overflowed = False

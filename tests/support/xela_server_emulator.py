@@ -74,16 +74,12 @@ class ServerEmulator:
     """Server of a VendorServer's messages, from the greeting of the first client; hangs up at the end.
 
     Every fault can be requested from any thread, and has happened when the call returns.
-
-    Attributes:
-        url: ws://HOST:PORT, once entered.
-        lost_messages: number of messages without room at a client.
     """
 
     def __init__(self, server: VendorServer, *, message_hz: float = 100.0) -> None:
         """Prepare to serve so many messages a second."""
-        self.url = ""
-        self.lost_messages = 0
+        self.url = ""  # ws://HOST:PORT, once entered
+        self.lost_messages = 0  # number of messages without room at a client
         self._vendor, self._message_hz = server, message_hz
         self._port = 0
         self._sequence = 0
