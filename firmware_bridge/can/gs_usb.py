@@ -42,8 +42,7 @@ _HIGHEST_EXTENDED: Final = 0x1FFFFFFF
 HEADER_BYTES: Final = 12
 FRAME_BYTES: Final = 20
 
-_SAMPLE_POINTS: Final = (0.75, 0.90)
-"""Range of sample points within which a bus of usual length works. Source: CiA 301, recommended bit timing."""
+_SAMPLE_POINTS: Final = (0.75, 0.90)  # within which a bus of usual length works. Source: CiA 301, bit timing
 
 _header = struct.Struct("<IIBBBB")
 _frame = struct.Struct("<IIBBBB8s")

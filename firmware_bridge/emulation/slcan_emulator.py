@@ -27,8 +27,7 @@ FRAME_S: Final = 0.000_13  # duration of a frame of eight bytes on a 1 Mbit/s bu
 
 CR: Final = b"\r"
 BEL: Final = b"\a"
-Played = Callable[[Track], Iterable[NDArray[np.int32]]]
-"""Function from a track to the scans that are played of it, in order."""
+Played = Callable[[Track], Iterable[NDArray[np.int32]]]  # from a track to the scans that are played of it
 
 
 def scan_frames(counts: NDArray[np.int32], controller: int, model: ModelMap = USPA44_MAP) -> list[CanFrame]:

@@ -22,11 +22,9 @@ from firmware_bridge.schedule import LINK_SILENT_S
 SourceKind = Literal["device", "replay", "emulated"]
 NoticeKind = Literal["lost", "silent", "back", "trouble", "well", "note"]
 
-SOON_RETRY_S: Final = 0.5
-"""Pause between tries in the first minute, in [s]: with the opening, a link that is back is used within 1 s."""
+SOON_RETRY_S: Final = 0.5  # pause between tries in the first minute: a link that is back is used within 1 s
 LATE_RETRY_S: Final = 2.0
-SOON_S: Final = 60.0
-"""Time of an outage with frequent tries, in [s]; later ones are rarer, to save the robot's processor."""
+SOON_S: Final = 60.0  # time of an outage with frequent tries; later ones are rarer, to save the robot's processor
 
 _Answer = TypeVar("_Answer")
 
@@ -102,8 +100,7 @@ def not_open() -> ValueError:
     return ValueError("the link is not open: use it in a with statement")
 
 
-LONG_UNREAD_NS: Final = 50_000_000
-"""Time without a read from which the process counts as stalled, in [ns]: more than twice the longest wait of a link."""
+LONG_UNREAD_NS: Final = 50_000_000  # without a read the process counts as stalled: over twice the longest wait
 
 
 class Unread:

@@ -27,8 +27,7 @@ INTERFACE: Final = 0
 CHANNEL: Final = 0
 ENDPOINT_IN: Final = 0x81
 REQUEST_TIMEOUT_MS: Final = 1000
-MOST_OLD_TRANSFERS: Final = 1000
-"""Most transfers drained from a stopped channel: its queue has 64, and one that goes on did not stop."""
+MOST_OLD_TRANSFERS: Final = 1000  # drained from a stopped channel: its queue has 64
 
 
 class GsUsbDevice(NamedTuple):

@@ -38,22 +38,18 @@ from firmware_bridge.schedule import ADAPTER_ASKED_NS
 
 DEFAULT_BAUD: Final = 3_000_000
 WRITE_TIMEOUT_S: Final = 1.0
-QUIET_S: Final = 0.02
-"""Silence after which the line counts as quiet, in [s]: a little over the 16 ms for which an FTDI chip holds bytes."""
+QUIET_S: Final = 0.02  # silence after which the line is quiet: a little over the 16 ms that an FTDI chip holds bytes
 LONGEST_SETTLE_S: Final = 0.3
 
-MOST_SILENT_OPENINGS: Final = 10
-"""Openings in a row without a scan after which stamps are not requested: a lasting link may reopen for days."""
+MOST_SILENT_OPENINGS: Final = 10  # in a row, after which stamps are not requested: a lasting link may reopen for days
 
 MOST_BYTES: Final = 65536  # most bytes read at once: as many as a kernel keeps for a serial port
 BYTE_S: Final = 5e-6  # time in [s] for a byte of a frame's line, of which a frame of 0.13 ms has 26 at most
 SHORTEST_SLEEP_S: Final = 0.0003
-LONGEST_WAIT_S: Final = 0.004
-"""Longest wait for the end of a scan after its first bytes, in [s]: sixteen frames take 2.1 ms on the bus."""
+LONGEST_WAIT_S: Final = 0.004  # for the end of a scan after its first bytes: sixteen frames take 2.1 ms on the bus
 LONGEST_LOOK_S: Final = 0.02  # longest time between two looks that find nothing, in [s]: `Unread` tells stalls by them
 
-ASKED_AGAIN_NS: Final = 5_000_000_000
-"""Time between two requests for the status flags of a silent adapter, in [ns]: each request clears them."""
+ASKED_AGAIN_NS: Final = 5_000_000_000  # between two requests for flags of a silent adapter: each request clears them
 BUS_ERRORS: Final = "the adapter reports errors on the bus, and no frame arrives: check bitrate, wiring and termination"
 _PORT_ERRORS: Final = (OSError, termios.error)  # pyserial lets termios.error through, which is no OSError
 

@@ -9,21 +9,15 @@ are dropped.
 
 from typing import Final, NamedTuple
 
-SLOWER: Final = 64
-"""Share of the time by which the smallest difference grows: a clock may be slow by as much. A delay of 0.1 s that lasts
-is forgotten in 7 s."""
+SLOWER: Final = 64  # share of the time by which the smallest difference grows: 0.1 s that last are forgotten in 7 s
+# Largest step back of the stamps before the clock counts as set or restarted: frames that change places in a driver's
+# queues step back by less than a millisecond. A wall clock set back by less, plus the pause, goes unnoticed.
 BACK_NS: Final = 4_000_000
-"""Largest step back of the stamps before the clock counts as set or restarted, in [ns].
-
-Frames that change places in a driver's queues step back by less than a millisecond. A wall clock set back between two
-frames by less than this plus the pause between them goes unnoticed: at 100 scans a second by 14 ms."""
-LONGEST_STEP_NS: Final = 20_000_000
-"""Time between two arrivals, in [ns], that counts at most: a read that was late is no evidence of a slow clock."""
+LONGEST_STEP_NS: Final = 20_000_000  # of the time between two arrivals counts at most: a late read makes no clock slow
+# In a row in which stamps advance twice as far as arrivals, or too slowly while reads were late: a backlog makes it so
+# once, and so does a machine that stood still.
 MOST_OFF: Final = 3
-"""Such times in a row in which stamps advance twice as far as arrivals, or too slowly while reads were late: a backlog
-makes it so once, and so does a machine that stood still."""
-SLOW_NS: Final = 10_000_000_000
-"""Time without a difference as small as the smallest, in [ns], after which the clock is slower than it may be."""
+SLOW_NS: Final = 10_000_000_000  # without a difference as small as the smallest, after which the clock is too slow
 
 
 class DeviceTime(NamedTuple):

@@ -29,11 +29,9 @@ PAD_RANGES: Final = MappingProxyType(
 """Constants of a pad, in this order, and their ranges: wider than for any pad, so that only slips are refused."""
 GAIN_RANGE: Final = (0.01, 100.0)
 GAINS: Final = len(AXES) * USPA44.taxel_count  # number of gains of the default pad
-GAIN_SPREAD: Final = 0.075
-"""Standard deviation of a chip's gain on one axis about 1, over new sensors: +-15 % are seen on devices."""
+GAIN_SPREAD: Final = 0.075  # standard deviation of a chip's gain on one axis over new sensors: +-15 % are seen
 LEVEL_90: Final = 1.645  # half width of a normal 90 % interval, in standard deviations
-UNMEASURED_CERTAINTY: Final = 0.9
-"""Certainty of gains without intervals: entered by a person, who has measured them somehow."""
+UNMEASURED_CERTAINTY: Final = 0.9  # of gains without intervals: a person has measured them somehow
 
 
 @dataclass(frozen=True)

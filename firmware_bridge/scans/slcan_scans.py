@@ -12,8 +12,7 @@ from firmware_bridge.scans.scan_assembler import Readings, ScanAssembler
 
 _MS_NS: Final = 1_000_000
 _WRAP_MS: Final = LAST_TIMESTAMP_MS + 1
-LONGEST_RUN_MS: Final = 50
-"""Longest time between stamps by the newest of which all are mapped to this machine's clock, in [ms]."""
+LONGEST_RUN_MS: Final = 50  # between stamps by the newest of which all are mapped to this machine's clock
 _LAYOUTS: Final = {PACKED_BYTES: ("HxHHHx", 4), STAMPED_BYTES: ("HxHHHxH", 5)}
 """Layouts of packed frames and the numbers in them, by their length: key and counts of a reading, stamp in [ms]."""
 

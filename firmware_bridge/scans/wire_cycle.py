@@ -23,12 +23,10 @@ LONGEST_PAUSE_NS: Final = 60_000_000
 """Longest pause between two readings of one scan, whatever the period, in [ns]: the slowest sensor on record has 17 ms
 there, and an FTDI chip holds bytes back for 16. After a longer one, as when the bus was off, a reading may belong to
 another press."""
-SHORTEST_PAUSE_NS: Final = 1_500_000
-"""Shortest time that counts as a pause, in [ns]: stamps and adapters with steps of 1 ms show less without one."""
+SHORTEST_PAUSE_NS: Final = 1_500_000  # that counts as one: stamps and adapters with steps of 1 ms show less without one
 MOST_INTERVALS: Final = 128  # intervals between cycles that give the period
 LEAST_INTERVALS: Final = 8  # intervals from which it shows lost cycles, and pauses are judged by the shorter ones
-MOST_DOUBTS: Final = 8
-"""Signs of another order in a row, without a whole cycle between them, after which the order is dropped."""
+MOST_DOUBTS: Final = 8  # signs of another order in a row after which the order is dropped
 
 
 class WireCycle:

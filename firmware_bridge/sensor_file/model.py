@@ -35,12 +35,9 @@ from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, LAST_UNIX_S, Base
 FILE_FORMAT: Final = "tactile-sensor"
 FILE_VERSION: Final = 1
 MOST_BYTES: Final = 1 << 16  # most bytes of a sensor file; a sensor takes 2 kB
-LONGEST_LINE_BYTES: Final = 2048
-"""Most bytes of a line, twice a line of all gains. The time of tomllib grows with the square of a key's dots: 60 kB
-took 27 s."""
+LONGEST_LINE_BYTES: Final = 2048  # twice a line of all gains; tomllib's time grows with the square of a key's dots
 _REMEDY: Final = "correct it, or write it again with edge-sr doctor --out"
-PARTS: Final = ("mounting", "force", "baseline", "gains")
-"""Parts of an entry that can be marked as assumed, or as measured on an emulated sensor."""
+PARTS: Final = ("mounting", "force", "baseline", "gains")  # that can be marked as assumed, or as emulated
 LARGEST_MM: Final = 1e5
 
 

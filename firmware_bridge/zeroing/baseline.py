@@ -23,8 +23,7 @@ from firmware_bridge.strict_table import LEAST_POSITIVE, Table, is_number, numbe
 
 COUNTS_ON_CIRCLE: Final = 0x10000
 FEWEST_SCANS: Final = 100
-FEWEST_RECORDED: Final = 30
-"""Scans for a baseline of a recording, which cannot be extended: a pad may be free for only half a second there."""
+FEWEST_RECORDED: Final = 30  # of a recording, where a pad may be free for only half a second
 
 # Limits for 100 scans. A still, free pad shows noise of sigma 1.1..2.8 counts on x and y, 2..4.7 on z,
 # so its 5th to 95th percentile spans up to 12 and 20 counts, and the medians of its first and last third
