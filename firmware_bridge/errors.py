@@ -1,16 +1,5 @@
 """Errors of the bridge, and the message where an optional dependency, an extra of pyproject.toml, is missing.
 
-BridgeError
-+-- DeviceError (OSError)
-|   +-- NoDeviceError          no adapter, or several without a choice
-|   +-- LinkLostError          the link was there and is gone
-+-- BaselineRefusedError (ValueError)  the pad moved or was loaded while zeroing
-+-- RecordingError (ValueError)        a recording or baseline file that cannot be used
-+-- NpzError (ValueError)              an npz file that is not plain arrays
-+-- CdrError (ValueError)              bytes that are no ROS message of their type
-+-- SensorFileError (ValueError)       a sensor file that cannot be used
-+-- SourceError (ValueError)           a text that names no source
-
 Bad frames, skipped bytes and torn scans are counted, never raised.
 """
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, unmapped, with_recorded
 from firmware_bridge.errors import BaselineRefusedError, as_typed
-from firmware_bridge.links.registry import place_recordings, recording_paths
+from firmware_bridge.links.registry import recording_paths
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
@@ -66,7 +66,7 @@ def open_recording(
     entries = {
         name: replace(stored.sensors.get(name, as_wired), baseline=baselines.get(name)) for name in sorted(sensors)
     }
-    place_recordings(replay, file.mountings)
+    replay.place(file.mountings)
     return Source(replay, sensor_file=replace(stored, sensors=entries), rate_hz=rate_hz)
 
 

@@ -29,7 +29,6 @@ LIMITS_BYTES: Final = 40
 HARDWARE_STAMPS: Final = 1 << 4
 
 RECEIVED: Final = 0xFFFFFFFF
-ECHO_IDS: Final = 10  # most frames under way to the bus at once, as in Linux; their echo ids are 0..9
 
 OVERFLOW_FLAG: Final = 1 << 0
 FD_FLAG: Final = 1 << 1
@@ -125,7 +124,7 @@ def mode(*, started: bool, features: int = 0) -> bytes:
 
 
 def encode_frame(frame: CanFrame, echo_id: int) -> bytes:
-    """Encode a standard data frame to send on channel 0; `echo_id`, below ECHO_IDS, comes back once it has gone out."""
+    """Encode a standard data frame to send on channel 0; `echo_id`, below 10, comes back once it has gone out."""
     return _frame.pack(echo_id, frame.can_id, len(frame.data), 0, 0, 0, frame.data)
 
 

@@ -162,8 +162,7 @@ class GsUsbLink(FrameLink):
         self._unread.empty_ns = self._clock_ns()  # from here on: this thread may not run for long after the start
         _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):
-            data = gs_usb.encode_frame(frame, number % gs_usb.ECHO_IDS)
-            device.write(0x02, data, REQUEST_TIMEOUT_MS)
+            device.write(0x02, gs_usb.encode_frame(frame, number), REQUEST_TIMEOUT_MS)
 
     def _stop(self, device: usb.core.Device) -> None:
         _request(device, gs_usb.MODE, gs_usb.mode(started=False))

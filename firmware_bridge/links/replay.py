@@ -124,13 +124,21 @@ class ReplayLink(Link):
         return scans
 
     def place(self, mountings: Mapping[str, Mounting]) -> None:
-        """Put the taxels of sensors that were recorded as wired in their places."""
-        self._tracks = [
-            replace(track, counts=mountings[track.sensor].place_counts(track.counts))
-            if track.sensor in mountings
-            else track
-            for track in self._tracks
-        ]
+        """Put the taxels of each CSV, which are as wired, in their places; those of other files are there already.
+
+        Raises SourceError where a CSV is of a pad with another number of taxels than its mounting.
+        """
+        as_wired = [file for file in self.recordings if file.path.suffix.lower() == ".csv"]
+        paths = {track.sensor: file.path for file in as_wired for track in file.tracks if track.sensor in mountings}
+        for number, track in enumerate(self._tracks):
+            if track.sensor in paths:
+                mounting, taxels = mountings[track.sensor], track.geometry.taxel_count
+                if taxels != mounting.taxel_count:
+                    raise SourceError(
+                        f"{paths[track.sensor]} has {taxels} taxels, and in the sensor file sensor {track.sensor} has "
+                        f"{mounting.taxel_count}: leave out the sensor file, or give that of this pad"
+                    )
+                self._tracks[number] = replace(track, counts=mounting.place_counts(track.counts))
 
     def notices(self) -> list[Notice]:
         """Return the notes on the files, once."""
