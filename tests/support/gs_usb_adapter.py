@@ -1,8 +1,7 @@
 """Emulated gs_usb adapter that treats requests, frames and a client that dies as a candleLight does.
 
 It is no kinder than the device. Its queue holds 64 frames; a frame without room is lost, and a flag on the next frame
-reports it. It receives nothing without the right bit timing. A client's death does not stop it. If the USB device is
-reset while a frame waits to be fetched, it is mute until it is unplugged (candleLight_fw issues 46, 165, up to 2026).
+reports it. It receives nothing without the right bit timing. A client's death does not stop it.
 """
 
 import struct
@@ -17,17 +16,9 @@ from firmware_bridge.can.slcan import CanFrame
 
 QUEUE_FRAMES: Final = 64
 CANDLELIGHT: Final = BitTimingLimits(
-    features=0x13 | gs_usb.HARDWARE_STAMPS,
-    clock_hz=48_000_000,
-    tseg1_min=1,
-    tseg1_max=16,
-    tseg2_min=1,
-    tseg2_max=8,
-    sjw_max=4,
-    brp_min=1,
-    brp_max=1024,
-    brp_inc=1,
-)
+    features=0x13 | gs_usb.HARDWARE_STAMPS, clock_hz=48_000_000, tseg1_min=1, tseg1_max=16, tseg2_min=1, tseg2_max=8,
+    sjw_max=4, brp_min=1, brp_max=1024, brp_inc=1,
+)  # fmt: skip
 _FRAME: Final = struct.Struct("<IIBBBB8s")
 
 
@@ -44,19 +35,12 @@ class GsUsbAdapter:
         self.right_bitrate = False  # true where its timing makes 1 Mbit/s
         self.sent: list[CanFrame] = []  # frames that it put on the bus for the client
         self.lost_frames = 0  # frames that had no room
-        self.mute = False  # true once it sends no more
         self._limits = limits
         self._stamped = False
         self._overflowed = False
-        self._queue: deque[bytes] = deque()
-        self._waiting_for_host: bytes | None = None
+        self.queue: deque[bytes] = deque()  # host frames that wait to be fetched
         self._changed = threading.Condition()
-        self._plugged = True
-
-    @property
-    def plugged(self) -> bool:
-        """True while its cable is in."""
-        return self._plugged
+        self.plugged = True  # while its cable is in
 
     def hear(self, *frames: CanFrame, stamp_us: int | None = None, channel: int = 0) -> None:
         """Receive frames from the bus, at `stamp_us` of its clock, by default now."""
@@ -69,7 +53,7 @@ class GsUsbAdapter:
     def unplug(self) -> None:
         """Pull the cable out, and wake all who wait for it."""
         with self._changed:
-            self._plugged = False
+            self.plugged = False
             self._changed.notify_all()
 
     def request_out(self, number: int, payload: bytes) -> None:
@@ -104,24 +88,15 @@ class GsUsbAdapter:
     def fetch(self, timeout_s: float | None) -> bytes | None:
         """Wait for the next host frame and return it; None when there is none in time, or the cable is out."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._plugged or (self._hand_over() and not self.mute), timeout_s)
-            if not self._plugged or self.mute:
-                return None
-            data, self._waiting_for_host = self._waiting_for_host, None
-            self._hand_over()
-            return data
-
-    def reset_usb(self) -> None:
-        """Reset the USB device as the host does, which does not restart it."""
-        with self._changed:
-            self.mute = self.mute or self._waiting_for_host is not None
+            self._changed.wait_for(lambda: not self.plugged or self.queue, timeout_s)
+            return self.queue.popleft() if self.plugged and self.queue else None
 
     def _receive(self, frames: tuple[CanFrame, ...], flags: int, stamp_us: int | None, channel: int) -> None:
         with self._changed:
             for frame in frames:
                 if not (self.started and self.right_bitrate):
                     return
-                if len(self._queue) >= QUEUE_FRAMES:
+                if len(self.queue) >= QUEUE_FRAMES:
                     self._overflowed = True
                     self.lost_frames += 1
                     continue
@@ -134,12 +109,5 @@ class GsUsbAdapter:
         data = _FRAME.pack(echo_id, raw_id, dlc, channel, flags, 0, payload)
         if self._stamped:
             data += struct.pack("<I", (time.monotonic_ns() // 1000 if stamp_us is None else stamp_us) & 0xFFFFFFFF)
-        self._queue.append(data)
-        self._hand_over()
+        self.queue.append(data)
         self._changed.notify_all()
-
-    def _hand_over(self) -> bool:
-        """Move one frame from the queue to the endpoint, and stays there until the host fetches it."""
-        if self._waiting_for_host is None and self._queue:
-            self._waiting_for_host = self._queue.popleft()
-        return self._waiting_for_host is not None
