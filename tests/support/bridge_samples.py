@@ -118,10 +118,10 @@ class SilentDevice:
         self.port = os.ttyname(self.client_fd)
         return self
 
-    def received(self, count: int) -> bytes:
+    def received(self, count: int, within_s: float = 5) -> bytes:
         """Return the first bytes that came, and any that came with them."""
         data = b""
-        while len(data) < count and select.select([self.device_fd], [], [], 5)[0]:
+        while len(data) < count and select.select([self.device_fd], [], [], within_s)[0]:
             data += os.read(self.device_fd, 1000)
         return data
 
