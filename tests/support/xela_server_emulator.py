@@ -1,7 +1,7 @@
 """Emulator of the vendor's xela_server on this machine, with sensors that play recordings.
 
-It is as strict as the real one: it sends its readings at its own pace, old or new, queues messages for a slow client
-until they are old, and restarts its count after a restart. Messages made by hand are here as well.
+It is as strict as the real one: it sends its readings at its own pace, old or new, and restarts its count after a
+restart. Messages made by hand are here as well.
 """
 
 import asyncio
@@ -79,7 +79,6 @@ class ServerEmulator:
     def __init__(self, server: VendorServer, *, message_hz: float = 100.0) -> None:
         """Prepare to serve so many messages a second."""
         self.url = ""  # ws://HOST:PORT, once entered
-        self.lost_messages = 0  # number of messages without room at a client
         self._vendor, self._message_hz = server, message_hz
         self._port = 0
         self._sequence = 0
@@ -151,11 +150,7 @@ class ServerEmulator:
         self._clients.discard(client)
 
     async def _send(self, text: str | bytes) -> None:
-        for client in list(self._clients):
-            if client.transport.get_write_buffer_size() > 1 << 20:  # unread bytes
-                self.lost_messages += 1
-            else:
-                broadcast([client], text)
+        broadcast(self._clients, text)
 
     async def _close(self, code: int, reason: str) -> None:
         await asyncio.gather(*(client.close(code, reason) for client in list(self._clients)))
