@@ -5,7 +5,7 @@ import struct
 
 import pytest
 from bridge_samples import make_counts
-from gs_usb_adapter import CANDLELIGHT
+from gs_usb_emulator import CANDLELIGHT
 from hypothesis import given
 from hypothesis import strategies as st
 

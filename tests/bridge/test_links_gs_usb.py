@@ -8,8 +8,18 @@ from itertools import count
 import pytest
 import usb.core
 from bridge_samples import frames_of
-from gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
-from gs_usb_emulator import ACCESS, IO, PIPE, TIMEOUT, GsUsbBackend, GsUsbPort, libusb_error
+from gs_usb_emulator import (
+    ACCESS,
+    CANDLELIGHT,
+    IO,
+    PIPE,
+    QUEUE_FRAMES,
+    TIMEOUT,
+    GsUsbAdapter,
+    GsUsbBackend,
+    GsUsbPort,
+    libusb_error,
+)  # fmt: skip
 from usb.backend import libusb1
 
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
