@@ -8,18 +8,7 @@ from itertools import count
 import pytest
 import usb.core
 from bridge_samples import frames_of
-from gs_usb_emulator import (
-    ACCESS,
-    CANDLELIGHT,
-    IO,
-    PIPE,
-    QUEUE_FRAMES,
-    TIMEOUT,
-    GsUsbAdapter,
-    GsUsbBackend,
-    GsUsbPort,
-    libusb_error,
-)  # fmt: skip
+from gs_usb_emulator import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter, GsUsbBackend, GsUsbPort, libusb_error
 from usb.backend import libusb1
 
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
@@ -55,7 +44,7 @@ class Watched(GsUsbAdapter):
         return self.then(super().fetch(timeout_s))
 
 
-@pytest.mark.parametrize("code", [IO, PIPE])
+@pytest.mark.parametrize("code", [errno.EIO, errno.EPIPE])
 def test_an_unplugging_may_be_another_error_and_a_signal_is_none(code):
     def interrupt(data):
         if signals:
@@ -198,7 +187,7 @@ def test_one_that_was_unplugged_is_told_from_others(wanted, serial_number, words
 
 class Deaf(GsUsbAdapter):
     def request_out(self, number, payload):
-        raise libusb_error(TIMEOUT)
+        raise libusb_error(errno.ETIMEDOUT)
 
 
 def test_adapters_that_cannot_be_used_are_given_back():
@@ -230,7 +219,7 @@ def get_backend(monkeypatch):
 def test_usb_that_cannot_be_read_or_without_libusb(get_backend, monkeypatch):
     class Closed(GsUsbBackend):
         def enumerate_devices(self):
-            raise libusb_error(ACCESS)
+            raise libusb_error(errno.EACCES)
 
     with pytest.raises(DeviceError, match="USB cannot be read"):
         list_devices(Closed())

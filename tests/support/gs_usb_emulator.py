@@ -9,6 +9,7 @@ client's death does not stop it.
 # pyright: reportIncompatibleMethodOverride=false
 
 import errno
+import os
 import struct
 import threading
 import time
@@ -24,12 +25,6 @@ import usb.core
 from firmware_bridge.can import gs_usb
 from firmware_bridge.can.gs_usb import BitTiming, BitTimingLimits
 from firmware_bridge.can.slcan import CanFrame
-
-IO, ACCESS, NO_DEVICE, NOT_FOUND, BUSY, TIMEOUT, OVERFLOW, PIPE = -1, -3, -4, -5, -6, -7, -8, -9
-_ERRNO: Final = {IO: errno.EIO, ACCESS: errno.EACCES, NO_DEVICE: errno.ENODEV, NOT_FOUND: errno.ENOENT} | {
-    BUSY: errno.EBUSY, TIMEOUT: errno.ETIMEDOUT, OVERFLOW: errno.EOVERFLOW, PIPE: errno.EPIPE
-}  # fmt: skip
-
 
 QUEUE_FRAMES: Final = 64
 CANDLELIGHT: Final = BitTimingLimits(
@@ -149,7 +144,7 @@ class GsUsbPort:
         self.kernel_driver = self.claimed = False  # who holds it
         self.handles = 0  # how often it is open
         self.permitted = True  # the user may open it
-        self.gone_as = NO_DEVICE  # the error of libusb that unplugging gives; host controllers differ
+        self.gone_as = errno.ENODEV  # the error of libusb that unplugging gives; host controllers differ
         self.usb_id = usb_id
         self.packet_bytes = packet_bytes
         self.address = 5
@@ -227,7 +222,7 @@ class GsUsbBackend(usb.backend.IBackend):
     def open_device(self, dev: _Plugged) -> _Plugged:
         dev.check()
         if not dev.port.permitted:
-            raise libusb_error(ACCESS)
+            raise libusb_error(errno.EACCES)
         dev.port.handles += 1
         return dev
 
@@ -242,7 +237,7 @@ class GsUsbBackend(usb.backend.IBackend):
     def claim_interface(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if dev_handle.port.kernel_driver or (dev_handle.port.claimed and not dev_handle.claimed_here):
-            raise libusb_error(BUSY)
+            raise libusb_error(errno.EBUSY)
         dev_handle.port.claimed = dev_handle.claimed_here = True
 
     def release_interface(self, dev_handle: _Plugged, intf: int) -> None:
@@ -256,13 +251,13 @@ class GsUsbBackend(usb.backend.IBackend):
     def detach_kernel_driver(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if not dev_handle.port.kernel_driver:
-            raise libusb_error(NOT_FOUND)
+            raise libusb_error(errno.ENOENT)
         dev_handle.port.kernel_driver = False
 
     def attach_kernel_driver(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if dev_handle.port.claimed:
-            raise libusb_error(BUSY)
+            raise libusb_error(errno.EBUSY)
         dev_handle.port.kernel_driver = True
 
     # Transfers.
@@ -287,7 +282,7 @@ class GsUsbBackend(usb.backend.IBackend):
             else:
                 answer = adapter.request_in(bRequest)
         except StalledError as error:
-            raise libusb_error(PIPE) from error
+            raise libusb_error(errno.EPIPE) from error
         answer = answer[: len(data)]
         data[: len(answer)] = array("B", answer)
         return len(answer)
@@ -298,9 +293,9 @@ class GsUsbBackend(usb.backend.IBackend):
         data = adapter.fetch(timeout / 1000 if timeout else None)
         if data is None:
             dev_handle.check()  # the cable may have come out meanwhile
-            raise libusb_error(TIMEOUT)
+            raise libusb_error(errno.ETIMEDOUT)
         if len(data) > len(buff):
-            raise libusb_error(OVERFLOW)
+            raise libusb_error(errno.EOVERFLOW)
         buff[: len(data)] = array("B", data)
         return len(data)
 
@@ -312,7 +307,7 @@ class GsUsbBackend(usb.backend.IBackend):
 
     def _check_claim(self, handle: _Plugged) -> None:
         if not handle.claimed_here:
-            raise libusb_error(IO)
+            raise libusb_error(errno.EIO)
 
     def _let_go(self, handle: _Plugged) -> None:
         if handle.claimed_here:
@@ -328,7 +323,7 @@ class GsUsbBackend(usb.backend.IBackend):
         return bytes((2 + len(encoded), 3)) + encoded
 
 
-def libusb_error(code: int) -> usb.core.USBError:
-    """Return the error that pyusb makes of one of libusb."""
-    kind = usb.core.USBTimeoutError if code == TIMEOUT else usb.core.USBError
-    return kind(f"libusb error {code}", code, _ERRNO[code])
+def libusb_error(number: int) -> usb.core.USBError:
+    """Return the error that pyusb makes of one of libusb, by its errno."""
+    kind = usb.core.USBTimeoutError if number == errno.ETIMEDOUT else usb.core.USBError
+    return kind(os.strerror(number), None, number)
