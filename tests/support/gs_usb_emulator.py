@@ -34,10 +34,6 @@ CANDLELIGHT: Final = BitTimingLimits(
 _FRAME: Final = struct.Struct("<IIBBBB8s")
 
 
-class StalledError(Exception):
-    """Refusal of a request by the adapter."""
-
-
 class GsUsbAdapter:
     """Adapter from one plugging-in to the next. Its methods may be called from any thread."""
 
@@ -69,10 +65,10 @@ class GsUsbAdapter:
             self._changed.notify_all()
 
     def request_out(self, number: int, payload: bytes) -> None:
-        """Obey a request; raises StalledError if it knows none such, or the payload is too short."""
+        """Obey a request, or stall if it knows none such, or the payload is too short."""
         lengths = {gs_usb.HOST_FORMAT: 4, gs_usb.BIT_TIMING: 20, gs_usb.MODE: 8}
         if len(payload) < lengths.get(number, 1 << 16):
-            raise StalledError(f"request {number} with {len(payload)} bytes")
+            raise libusb_error(errno.EPIPE)
         with self._changed:
             if number == gs_usb.BIT_TIMING:
                 timing = BitTiming(*struct.unpack_from("<5I", payload))
@@ -84,10 +80,10 @@ class GsUsbAdapter:
                     self._stamped = features & self._limits.features & gs_usb.HARDWARE_STAMPS != 0
 
     def request_in(self, number: int) -> bytes:
-        """Answer a request; raises StalledError if it knows none such."""
-        if number == gs_usb.BIT_TIMING_LIMITS:
-            return struct.pack("<10I", *self._limits)
-        raise StalledError(f"request {number}")
+        """Answer a request, or stall if it knows none such."""
+        if number != gs_usb.BIT_TIMING_LIMITS:
+            raise libusb_error(errno.EPIPE)
+        return struct.pack("<10I", *self._limits)
 
     def take(self, data: bytes) -> None:
         """Take a host frame to send, and echo it."""
@@ -273,16 +269,13 @@ class GsUsbBackend(usb.backend.IBackend):
         timeout: int,
     ) -> int:
         adapter = dev_handle.check()
-        try:
-            if not bmRequestType & 0x80:  # to the device
-                adapter.request_out(bRequest, data.tobytes())
-                return len(data)
-            if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):  # get a descriptor, of a text
-                answer = self._text(dev_handle.port, wValue & 0xFF)
-            else:
-                answer = adapter.request_in(bRequest)
-        except StalledError as error:
-            raise libusb_error(errno.EPIPE) from error
+        if not bmRequestType & 0x80:  # to the device
+            adapter.request_out(bRequest, data.tobytes())
+            return len(data)
+        if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):  # get a descriptor, of a text
+            answer = self._text(dev_handle.port, wValue & 0xFF)
+        else:
+            answer = adapter.request_in(bRequest)
         answer = answer[: len(data)]
         data[: len(answer)] = array("B", answer)
         return len(answer)
@@ -318,7 +311,7 @@ class GsUsbBackend(usb.backend.IBackend):
             return b"\x04\x03\x09\x04"  # English
         text = {2: port.product, 3: port.serial_number}.get(index)
         if text is None:
-            raise StalledError(f"text {index}")
+            raise libusb_error(errno.EPIPE)
         encoded = text.encode("utf-16-le")
         return bytes((2 + len(encoded), 3)) + encoded
 
