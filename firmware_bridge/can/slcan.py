@@ -1,25 +1,16 @@
 """Decoder and encoder of CAN frames as slcan text. No I/O.
 
-A line ends at CR (or at BEL, an adapter's refusal). Within a line the frame is the text from the
-LAST frame letter (t T r R) to the CR: hex digits hold no such letter, so a letter in mid-line is
-the start of a whole frame after the remains of another, or after noise. That text must fit its own
-length digit exactly, or the line gives no frame.
+A line ends at CR, or at BEL, an adapter's refusal. Its frame is the text from the LAST frame letter (t T r R) to the
+CR: hex digits hold no such letter, so one in mid-line begins a whole frame after the remains of another, or after
+noise. That text must fit its own length digit exactly, or the line gives no frame.
 
-An adapter stamps either every line with a time or no line. The decoder learns the form from LINES_TO_LEARN
-frames in a row of one form; from then on a frame of the other form is a bad line, until as many of those come
-in a row. So four data digits lost from a stamped line make no false frame without a stamp. Before a form is
-learnt, both are accepted.
+An adapter stamps either every line with a time or no line. The decoder learns the form from LINES_TO_LEARN frames in a
+row of one form; from then on a frame of the other form is a bad line, until as many of those come in a row. So four
+data digits lost from a stamped line make no false frame without a stamp. Before a form is learnt, both are accepted.
 
-A prefix cannot harm the frame after it, which is checked as if it stood alone. A data digit corrupted
-INTO a letter starts a false frame, but too few characters follow it for eight data bytes; only the
-length digit of a stamped line leaves enough, and that false frame has no stamp.
-
-Of an adapter's own lines it takes eight flags in answer to `F`, which the request clears (Lawicel CAN232 manual,
-version 3).
-
-The limit: slcan has no checksum on the serial leg. A flipped hex digit, and a loss of exactly one
-line's length across two lines (the head of one frame with the tail of the next), give a well-formed
-frame that was never sent. The text does not show it. Such a value lasts for one scan.
+The limit: slcan has no checksum on the serial leg. A flipped hex digit, and a loss of exactly one line's length across
+two lines (the head of one frame with the tail of the next), give a well-formed frame that was never sent. Such a value
+lasts for one scan.
 """
 
 import re
@@ -31,7 +22,7 @@ BITRATE_1M: Final = b"S8\r"
 OPEN: Final = b"O\r"
 STAMPS_ON: Final = b"Z1\r"
 STAMPS_OFF: Final = b"Z0\r"
-STATUS_FLAGS: Final = b"F\r"
+STATUS_FLAGS: Final = b"F\r"  # answered by eight flags, and clears them. Source: Lawicel CAN232 manual, version 3
 BUS_FLAGS: Final = 0xA0  # flags of errors on the bus, and of a controller that these have made passive
 
 LONGEST_LINE: Final = 30  # most characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp

@@ -1,16 +1,16 @@
 """Assembly of the frames on a wire to scans. No I/O, no clock.
 
-The wire has no end-of-scan marker. A scan closes when every taxel has come, or the last one of the sensor's cycle, or
-when the next reading belongs to another cycle: after a pause, or where the order of the taxels has wrapped round
-(`wire_cycle`). Then it is torn. Readings of no certain cycle are left out and counted (`resynchronised`): the rest of
-the cycle into which the link was opened, and fragments of fewer than half of the taxels that no pause separates.
+A scan closes when every taxel has come, or the last one of the sensor's cycle, or when the next reading belongs to
+another cycle: after a pause, or where the order of the taxels has wrapped round (`wire_cycle`). Then it is torn.
+Readings of no certain cycle are left out and counted (`resynchronised`): the rest of the cycle into which the link was
+opened, and fragments of fewer than half of the taxels that no pause separates.
 
 Without time stamps a whole cycle that ends late waits for the next ones to show whether a cycle was lost: with sixteen
 frames lost between them, its halves may be of two. Then it is left out, too. Limit: nothing closes while no reading
 comes, so half a scan at the end of a stream is never returned.
 
 Frames that were read together are taken together: those of a sensor that go on in its order, without a pause, join its
-open scan at once. So a scan costs little, also where the frames of several sensors mix.
+open scan at once, also where the frames of several sensors mix.
 """
 
 import struct

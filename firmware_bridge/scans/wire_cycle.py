@@ -1,14 +1,12 @@
 """Cycle of a sensor on the wire, as the stream shows it: the order of its taxels, and the longest pause within it.
 
 Nothing marks the beginning of a cycle. Two things show it: the bus pauses between cycles, and the order of the taxels,
-which is the same each time, wraps round. By default the order is that of the ids. A sensor with another order gives
-fragments; then its cycles are cut by pauses alone, until two in a row came in the same order, which is then the
-sensor's.
+by default that of the ids, wraps round. A sensor with another order gives fragments; then its cycles are cut by pauses
+alone, until two in a row came in the same order, which is then the sensor's.
 
 A pause within a cycle ends it where whole cycles may have been lost meanwhile, so from half a period on, of the shorter
 ones, as a lost cycle makes them longer. Until there are enough, the shortest time between two readings of one taxel is
-the period; while the order is to be learnt, an eighth of it is a pause. Limit: where nearly all cycles of the first
-eight are lost, two may mix.
+the period. Limit: where nearly all cycles of the first eight are lost, two may mix.
 
 Arrivals show no pause within what was read in one piece. There a lost cycle shows by the count: cycles end a period
 apart, and a read only delays them. So one that ends late by most of a period may be of two cycles, unless a later one

@@ -1,18 +1,16 @@
 """Stage from readings of the vendor's server to scans. No I/O, no clock.
 
 The server sends its readings at its own pace, old ones again, and the reading of a taxel with older ones of its
-neighbours: 507 messages a second were observed for a sensor that renewed seven taxels meanwhile. So its pace has no
-meaning. A taxel has been renewed if its counts have changed, or if it is due by `ups`: then it has the same counts
-again. A scan closes once every taxel has been renewed that is renewed about as often as most; then it holds the newest
-reading of each.
+neighbours: 507 messages a second were observed for a sensor that renewed seven taxels meanwhile. A taxel has been
+renewed if its counts have changed, or if it is due by `ups`: then it has the same counts again. A scan closes once
+every taxel has been renewed that is renewed about as often as most; then it holds the newest reading of each.
 
 - A still pad gives scans at the rate of `ups`, repeated ones if it has no noise. A loose cable gives no scan, however
   long the server repeats the last reading: a taxel is absent while its `ups` is 0, and all are while the sensor's time
-  stands still. Where the server reports either for all taxels and their counts go on changing, its report is wrong, and
-  the usual `ups` replaces the zeros.
+  stands still. Where all would be absent and their counts go on changing, the usual `ups` replaces the zeros.
 - A message that renews most taxels belongs to one cycle, and the others in it count as repeated: noise does that now
   and then, and waiting for them would cost a cycle.
-- Within a cycle nothing shows which readings belong together; slow servers mix those of two cycles, as on the wire.
+- Within a cycle nothing shows which readings belong together; slow servers mix those of two cycles.
 """
 
 from collections.abc import Mapping

@@ -19,7 +19,7 @@ from firmware_bridge.in_place import read_bounded, write_in_place
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
-from firmware_bridge.strict_table import LEAST_POSITIVE, Table, is_number, numbers, one_of, reader, whole
+from firmware_bridge.strict_table import Table, is_number, numbers, one_of, reader, whole
 
 COUNTS_ON_CIRCLE: Final = 0x10000
 FEWEST_SCANS: Final = 100
@@ -48,7 +48,7 @@ _read_sensor: Final = reader(
     f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters",
 )
 _read_date: Final = reader(
-    lambda value: value is None or is_number(value, LEAST_POSITIVE, LAST_UNIX_S), "seconds since 1970, or null"
+    lambda value: value is None or is_number(value, 1, LAST_UNIX_S), "seconds since 1970, or null"
 )
 
 

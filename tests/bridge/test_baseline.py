@@ -218,7 +218,7 @@ def test_a_baseline_of_another_order_of_taxels_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("cell", "created_unix_s", "scans"), [(0, LAST_UNIX_S, 1), (65_535.9, 1e-6, 2**31 - 1), (1, np.nan, 1)]
+    ("cell", "created_unix_s", "scans"), [(0, LAST_UNIX_S, 1), (65_535.9, 1, 2**31 - 1), (1, np.nan, 1)]
 )
 def test_a_baseline_written_by_hand_as_the_docs_say_needs_no_id(tmp_path, cell, created_unix_s, scans):
     path = tmp_path / "zero.json"
