@@ -104,7 +104,6 @@ class SlcanAdapter:
 
     def __init__(self) -> None:
         """Switch the adapter on."""
-        self.flags = 0  # flags that `F` reports, Lawicel's bits; the report clears them
         self.channel_open = False  # True while it passes on the frames of the bus
         self._bitrate: int | None = None
         self._timestamps = False
@@ -136,14 +135,9 @@ class SlcanAdapter:
 
     def _obey(self, command: bytes) -> bytes:
         name, value = command[:1], command[1:]
-        if name == b"t" and self.channel_open:
-            return b"z" + CR
-        if name == b"V" and not value:
-            return b"V1013" + CR
         if self.channel_open:
             if command == b"F":
-                flags, self.flags = self.flags, 0
-                return b"F%02X" % flags + CR
+                return b"F00" + CR  # no error flag
             if command != b"C":
                 return BEL
             self.channel_open = False

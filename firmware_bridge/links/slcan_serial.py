@@ -236,7 +236,7 @@ class SlcanSerialLink(Link):
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""
-        return self._scans.can_ids
+        return self._scans.assembler.can_ids
 
     def serial_line(self) -> tuple[str, int]:
         """Return the port and its speed in [bit/s]."""

@@ -186,7 +186,7 @@ def with_cell(cell: object) -> list:
     return counts
 
 
-def test_the_id_stands_for_sensor_counts_and_time_but_not_for_drift():
+def test_the_id_is_of_sensor_counts_and_time_not_of_drift():
     others = [made(sensor="6"), made(REST + 1), made(created_unix_s=1_001.0)]
     assert len({BASELINE.id, *(other.id for other in others)}) == 4
     assert made().id == BASELINE.id == "d148ecd3"
