@@ -46,7 +46,7 @@ def test_a_server_with_no_sensor_that_fits_is_an_error():
         with pytest.raises(DeviceError, match=words) as refused, XelaServerLink(emulator.url) as link:
             read_scans(link, 1)
         assert not isinstance(refused.value, LinkLostError)  # another try would not help
-        wait_for(lambda: len(list(Path("/proc/self/fd").iterdir())) == before)
+        wait_for(lambda: len(list(Path("/proc/self/fd").iterdir())) <= before)
 
 
 # It goes, hangs and comes back.
