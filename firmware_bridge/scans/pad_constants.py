@@ -46,8 +46,7 @@ class Pad:
     counts_per_newton: float | None = None  # summed z per [N]
     pitch_mm: float | None = None  # true distance of the taxels of a uSPa44, in [mm]
     free_sides: float | None = None  # compliance of the pad's sides, 0 where they are held, 1 where nothing holds them
-    # Lowest and highest value of a constant by its measurement; nothing is computed from them.
-    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # of constants, by their measurement
     # Relative gain of each place on each axis, 1 where it reads as the others: x of all places row by row, then y, then
     # z, along the pad's axes. Networks that use gains get readings divided by them.
     gains: tuple[float, ...] | None = None

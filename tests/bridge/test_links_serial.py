@@ -11,14 +11,13 @@ import time
 
 import pytest
 import serial
-from bridge_samples import SilentDevice, read_scans
+from bridge_samples import SilentDevice, cycle_lines, read_scans
 from edge_samples import wait_for
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.slcan_serial import BUS_ERRORS, PortReader, SlcanSerialLink
-from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
 
@@ -200,20 +199,6 @@ def test_an_adapter_that_goes_while_it_is_opened_or_closed(monkeypatch, error):
 
 
 MS = 1_000_000
-
-
-def cycle_lines(number: int, stamp_ms: int | None = None) -> list[bytes]:
-    """The lines of one scan; of stamped ones every eighth frame has the next millisecond."""
-    return [
-        encode_frame(
-            CanFrame(
-                can_id,
-                bytes([9, 1, number % 256, 2, number % 256, taxel, 3, 9]),
-                timestamp_ms=None if stamp_ms is None else (stamp_ms + place // 8) % 60_000,
-            )
-        )
-        for place, (can_id, taxel) in enumerate(USPA44_MAP.wire_order("4"))
-    ]
 
 
 # Time stamps.
