@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
+from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.scans.scan_assembler import Readings, ScanAssembler, key
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, MOST_DOUBTS
@@ -219,20 +218,3 @@ def test_no_read_sleeps_while_an_order_is_to_be_learnt():
     assert assembler.fewest_missing() == 1
     feed(assembler, cycle(0) + cycle(1), 10_000)
     assert assembler.fewest_missing() == 16, "a sensor that exists does not wait for one that does not"
-
-
-def test_a_pause_is_measured_by_the_clock_of_the_device():
-    """Its times on our clock are a guess, and a better one may hide a pause: half a press would join another's half."""
-    assembler, clock = ScanAssembler(USPA44_MAP), DeviceClock(1_000_000, None)
-    feed(assembler, cycle(0))
-    for number, reading in enumerate(cycle(1)[:9]):
-        feed_one(assembler, reading, 400_000_000, clock.at(number, 400_000_000))
-    (torn,) = feed_one(assembler, cycle(2)[9], 450_000_000, clock.at(350, 450_000_000))
-    assert not torn.complete
-
-
-def test_a_scan_has_the_time_of_the_stamp_of_its_last_frame():
-    assembler = ScanAssembler(USPA44_MAP)
-    for place, (can_id, _) in enumerate(USPA44_MAP.wire_order("4")):
-        scans = assembler.feed_frame(CanFrame(can_id, bytes(8)), 900 + place, DeviceTime(600 + place, 5 + place))
-    assert [(scan.time_ns, scan.device_ns) for scan in scans] == [(915, 615)]
