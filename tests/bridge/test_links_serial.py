@@ -220,14 +220,11 @@ def test_any_chunking_gives_the_same_times(cut):
         assert whole.counters() == pieces.counters()
 
 
-def test_the_same_stamp_again_is_a_minute_later():
-    scans = SlcanScans()
-    scans.feed(b"".join(cycle_lines(0, 100)), 10**12)  # learns the form
-    first, second = (scans.feed(b"".join(cycle_lines(n, 200)), 10**12 + (100 + n * 60_000) * MS)[0] for n in range(2))
-    assert first.device_ns is not None and second.device_ns == first.device_ns + 60_000 * MS
-    scans.begin_anew()
-    (scan,) = scans.feed(b"".join(cycle_lines(1, 20)), second.time_ns + 30 * MS)
-    assert scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns <= MS
+def test_stamps_count_from_zero_again_each_minute():
+    scans, at_ms = SlcanScans(), ((59_800, 0), (59_900, 100), (100, 340))  # the last of them is read late
+    first, second, third = (scans.feed(b"".join(cycle_lines(1, ms)), 10**12 + read * MS)[0] for ms, read in at_ms)
+    assert first.device_ns is not None and second.device_ns == first.device_ns + 100 * MS
+    assert third.device_ns == first.device_ns + 300 * MS
 
 
 LATE = cycle_lines(0, 0)[0][:-5] + b"FA00\r"  # no milliseconds of a minute
