@@ -62,8 +62,9 @@ def test_a_still_pad_gives_its_median():
     counts = still(100)
     baseline = zeroed(counts, estimator)
     assert Baseline.from_counts("4", counts, 1234.5).id == baseline.id
-    with pytest.raises(BaselineRefusedError, match="to 65536, expected"):
-        Baseline.from_counts("6", np.where(counts == counts.max(), 65_536, counts), 99.0)
+    for wrong, words in ((65_536, " to 65536, expected"), (ABSENT, "-1 to .*, expected")):
+        with pytest.raises(BaselineRefusedError, match=words):
+            Baseline.from_counts("6", np.where(counts == counts.max(), wrong, counts), 99.0)
     assert (baseline.counts == np.median(counts, axis=0)).all()
     assert baseline.counts.dtype == np.float32 and not baseline.counts.flags.writeable
     assert (baseline.sensor, baseline.scans, baseline.origin, baseline.created_unix_s) == ("4", 100, "start-up", 1234.5)
