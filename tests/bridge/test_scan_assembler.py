@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.scans.scan_assembler import Readings, ScanAssembler, key
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, MOST_DOUBTS
@@ -31,12 +30,6 @@ def feed_all(assembler: ScanAssembler, readings: list[Reading], time_ns: int, *s
 
 def feed(assembler: ScanAssembler, readings: list[Reading], start_ns: int = 0) -> list[Scan]:
     return [scan for i, reading in enumerate(readings) for scan in feed_all(assembler, [reading], start_ns + i)]
-
-
-def feed_one(assembler: ScanAssembler, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
-    if device is None:
-        return feed_all(assembler, [reading], time_ns)
-    return feed_all(assembler, [reading], time_ns, [device.own_ns], device.host_ns - device.own_ns)
 
 
 def counters(assembler: ScanAssembler) -> dict[str, int]:
@@ -142,11 +135,10 @@ def test_what_comes_after_a_pause_is_of_another_scan(known):
     scans = []
     for reading, time_ns in zip([*before, *cycle(3)[:12]], times_ns, strict=True):
         # The device's own times count where there are any: being late here says nothing of the bus.
-        device = DeviceTime(0, time_ns) if known else None
-        scans += feed_one(assembler, reading, 10 * time_ns if known else time_ns, device)
+        stamps = ([time_ns], -time_ns) if known else ()
+        scans += feed_all(assembler, [reading], 10 * time_ns if known else time_ns, *stamps)
     assert [int(scan.fresh.sum()) for scan in scans] == [16, 16, 16, 11]
-    device = DeviceTime(0, times_ns[-1] + 1) if known else None
-    (scan,) = [scan for reading in cycle(4) for scan in feed_one(assembler, reading, times_ns[-1] + 1, device)]
+    (scan,) = feed_all(assembler, cycle(4), times_ns[-1] + 1, *([[times_ns[-1] + 1] * 16] if known else []))
     assert set(scan.counts[2].ravel().tolist()) == {3004} and counters(assembler)["resynchronised"] == 1
 
 
