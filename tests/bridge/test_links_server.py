@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from bridge_samples import make_recording, read_scans, read_until_lost, stacked
 from edge_samples import wait_for
-from xela_server_emulator import ServerEmulator, VendorServer, looping, lose, read_notices
+from xela_server_emulator import ServerEmulator, looping, lose, read_notices
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import xela_server
@@ -21,7 +21,7 @@ from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 
 def test_every_scan_comes_once_and_in_order():
     recordings = [make_recording(30, seed=1), make_recording(30, seed=2)]
-    with ServerEmulator(VendorServer(recordings)) as server, XelaServerLink(server.url) as link:
+    with ServerEmulator(recordings) as server, XelaServerLink(server.url) as link:
         scans = read_until_lost(link)
     for sensor, recording in zip(("1", "2"), recordings, strict=True):
         mine = [scan for scan in scans if scan.sensor == sensor]
@@ -34,13 +34,13 @@ def test_every_scan_comes_once_and_in_order():
 
 
 def test_sensors_of_other_shapes_are_left_out():
-    with ServerEmulator(looping(others=[("uSPa46", 24)])) as server, XelaServerLink(server.url) as link:
+    with looping(others=[("uSPa46", 24)]) as server, XelaServerLink(server.url) as link:
         assert {scan.sensor for scan in read_scans(link, 5)} == {"1"}
         assert link.trouble == "sensor 2 is left out: 'uSPa46' with 24 taxels, expected 16"
 
 
 def test_a_server_with_no_sensor_that_fits_is_an_error():
-    with ServerEmulator(VendorServer([], others=[("uSPa46", 24)], loop=True)) as emulator:
+    with ServerEmulator([], others=[("uSPa46", 24)], loop=True) as emulator:
         before = len(list(Path("/proc/self/fd").iterdir()))
         words = "no sensor that can be used: sensor 1 is left out: 'uSPa46'"
         with pytest.raises(DeviceError, match=words) as refused, XelaServerLink(emulator.url) as link:
@@ -53,10 +53,10 @@ def test_a_server_with_no_sensor_that_fits_is_an_error():
 
 
 def test_it_is_told_why_a_server_closes_or_is_left():
-    with ServerEmulator(looping()) as server:
+    with looping() as server:
         link = XelaServerLink(server.url)
         with link:
-            server.say(looping().message(7, 0.5, 1e9).encode())  # a binary message is one, too
+            server.say(server.message(7, 0.5, 1e9).encode())  # a binary message is one, too
             assert read_scans(link, 1)
             server.close_all(1012, "service restart")
             assert "service restart" in lose(link)
@@ -103,7 +103,7 @@ def test_others_that_listen_there(answer, words, limits):
 
 
 def test_one_that_hangs_is_lost_and_used_again_once_it_answers(limits):
-    with ServerEmulator(looping()) as server, LinkReader(XelaServerLink(server.url), math.inf) as link:
+    with looping() as server, LinkReader(XelaServerLink(server.url), math.inf) as link:
         read_scans(link, 3)
         limits(xela_server, OPENING_S=0.2)
         server.freeze()

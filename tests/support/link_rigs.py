@@ -11,7 +11,7 @@ import can
 from bridge_samples import decoded, frames_of, make_counts, read_scans, wait_for, write_recording
 from can.interfaces.virtual import VirtualBus
 from gs_usb_emulator import GsUsbBackend, GsUsbPort
-from xela_server_emulator import ServerEmulator, looping
+from xela_server_emulator import looping
 
 from firmware_bridge.can.slcan import CanFrame, SlcanDecoder, encode_frame
 from firmware_bridge.emulation.pty_port import PseudoPort, listen
@@ -257,7 +257,7 @@ class ServerRig(Rig):
     decoder = ServerScans
 
     def __init__(self, folder, monkeypatch) -> None:
-        self._server = ServerEmulator(looping())
+        self._server = looping()
         self._server.__enter__()
         self.name = f"xela-server:{self._server.url}"
         self.lose, self.put_back = self._server.kill, self._server.start_again

@@ -29,39 +29,6 @@ UNIX_S: Final = 1_768_365_606.25
 MS: Final = 1_000_000
 
 
-class VendorServer:
-    """Model of a server with sensors that play recordings: its message at any time."""
-
-    def __init__(
-        self, recordings: Sequence[Recording], *, loop: bool = False, others: Sequence[tuple[str, int]] = ()
-    ) -> None:
-        """Prepare to play each track as a sensor, over and over where it is to loop.
-
-        `others` are model and number of taxels of sensors other than 4x4 ones, after all the others.
-        """
-        self._loop = loop
-        self._others = [sensor_entry(model=model, taxels=taxels) for model, taxels in others]
-        self._sensors = [
-            (track.counts, playing_rate_hz(recording, track, None))
-            for recording in recordings
-            for track in recording.tracks
-        ]
-
-    def ended(self, elapsed_s: float) -> bool:
-        """Return True once every cycle of every sensor could be sent."""
-        return not self._loop and all(elapsed_s * rate_hz >= len(counts) for counts, rate_hz in self._sensors)
-
-    def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
-        """Return the message on all sensors at a time in [s] from its start, `unix_s` [s] on its own clock."""
-        entries: list[dict[str, Any]] = []
-        for played, rate_hz in self._sensors:
-            # A message that is sent at the time of a cycle holds it, however that time was rounded.
-            cycle = int(elapsed_s * rate_hz + 1e-6)
-            counts = played[cycle % len(played) if self._loop else min(cycle, len(played) - 1)]
-            entries.append(sensor_entry(counts, ups=float(rate_hz), time_s=unix_s - elapsed_s % (1 / rate_hz)))
-        return message(sequence, *entries, *self._others, time_s=unix_s)
-
-
 HOST: Final = "127.0.0.1"  # this machine alone, so that no other one takes its messages for a sensor's
 _QUIET: Final = logging.getLogger("xela_server_emulator")
 _QUIET.addHandler(logging.NullHandler())
@@ -69,12 +36,28 @@ _QUIET.propagate = False
 
 
 class ServerEmulator:
-    """Server of a VendorServer's messages to each client, from its greeting on; hangs up at the end."""
+    """Server of messages on sensors that play recordings, to each client from its greeting on; hangs up at the end."""
 
-    def __init__(self, server: VendorServer, *, message_hz: float = 100.0) -> None:
-        """Prepare to serve so many messages a second."""
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        *,
+        loop: bool = False,
+        others: Sequence[tuple[str, int]] = (),
+        message_hz: float = 100.0,
+    ) -> None:
+        """Prepare to play each track as a sensor, over and over where it is to loop, in so many messages a second.
+
+        `others` are model and number of taxels of sensors other than 4x4 ones, after all the others.
+        """
         self.url = ""  # ws://HOST:PORT, once entered
-        self._vendor, self._message_hz = server, message_hz
+        self._loop, self._message_hz = loop, message_hz
+        self._others = [sensor_entry(model=model, taxels=taxels) for model, taxels in others]
+        self._sensors = [
+            (track.counts, playing_rate_hz(recording, track, None))
+            for recording in recordings
+            for track in recording.tracks
+        ]
         self._port = 0
         self._clients: set[ServerConnection] = set()
         self._answers = threading.Event()
@@ -127,16 +110,27 @@ class ServerEmulator:
         for client in list(self._clients):
             client.close(code, reason)
 
+    def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
+        """Return the message on all sensors at a time in [s] from its start, `unix_s` [s] on its own clock."""
+        entries: list[dict[str, Any]] = []
+        for played, rate_hz in self._sensors:
+            # A message that is sent at the time of a cycle holds it, however that time was rounded.
+            cycle = int(elapsed_s * rate_hz + 1e-6)
+            counts = played[cycle % len(played) if self._loop else min(cycle, len(played) - 1)]
+            entries.append(sensor_entry(counts, ups=float(rate_hz), time_s=unix_s - elapsed_s % (1 / rate_hz)))
+        return message(sequence, *entries, *self._others, time_s=unix_s)
+
     def _attend(self, client: ServerConnection) -> None:
         """Greet a client, and send messages to the end of the recordings."""
         start_s, ticks = time.monotonic(), 0
+        played_s = math.inf if self._loop else max(len(counts) / rate_hz for counts, rate_hz in self._sensors)
         with suppress(ConnectionClosed):
             client.send(json.dumps({"message": WELCOME, "time": time.time(), "version": "1.8.0b_208601"}))
             self._clients.add(client)
-            while not self._vendor.ended(ticks / self._message_hz):
+            while ticks / self._message_hz < played_s:
                 time.sleep(max(0.0, start_s + ticks / self._message_hz - time.monotonic()))
                 self._answers.wait()
-                client.send(self._vendor.message(ticks, ticks / self._message_hz, time.time()))
+                client.send(self.message(ticks, ticks / self._message_hz, time.time()))
                 behind = math.floor((time.monotonic() - start_s) * self._message_hz) - ticks
                 ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
         self._clients.discard(client)
@@ -166,8 +160,8 @@ def message(sequence: object, *entries: dict, time_s: object = UNIX_S, **more) -
     return json.dumps({"message": sequence, "time": time_s, "version": "1.8.0b_208601", **sensors, **more})
 
 
-def looping(**options) -> VendorServer:
-    return VendorServer([make_recording(50)], loop=True, **options)
+def looping(**options) -> ServerEmulator:
+    return ServerEmulator([make_recording(50)], loop=True, **options)
 
 
 def lose(link):
