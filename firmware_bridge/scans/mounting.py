@@ -8,7 +8,7 @@ never zeroed: their axes are turned at once.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,16 +53,13 @@ class Mounting:
         turned *= np.asarray(self.signs, dtype=np.float32)[:, None, None]
         return turned
 
-    def place_counts(self, counts: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Reorder counts (..., 3, rows, cols) from the order of the id map to the places on the pad."""
-        return counts.reshape(*counts.shape[:-2], -1)[..., list(self.order)].reshape(counts.shape)
+    def place_counts(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values of all taxels, (..., rows, cols), from the order of the id map at the places on the pad."""
+        return values.reshape(*values.shape[:-2], -1)[..., list(self.order)].reshape(values.shape)
 
     def place(self, scan: Scan) -> Scan:
         """Reorder a scan from the order of the id map to the places on the pad, and turn the vendor's newtons."""
-        shape = scan.fresh.shape
-        order = list(self.order)
-        counts = self.place_counts(scan.counts)
-        fresh, renewed = (array.ravel()[order].reshape(shape) for array in (scan.fresh, scan.renewed))
+        counts, fresh, renewed = map(self.place_counts, (scan.counts, scan.fresh, scan.renewed))
         for array in (counts, fresh, renewed):
             array.setflags(write=False)
         vendor = None if scan.vendor is None else self._place_vendor(scan.vendor)
@@ -81,17 +78,11 @@ class Mounting:
         )
 
     def _place_vendor(self, vendor: VendorReading) -> VendorReading:
-        order = list(self.order)
-        newtons = vendor.newtons
-        if newtons is not None:
-            along = newtons.reshape(len(AXES), -1)[[1, 0, 2] if self.swap_xy else [0, 1, 2]][:, order]
-            along *= np.asarray(self.signs, dtype=np.float32)[:, None]
-            newtons = along.reshape(newtons.shape)
-        temperature_k, ups_hz = (
-            None if array is None else array.ravel()[order].reshape(array.shape)
-            for array in (vendor.temperature_k, vendor.ups_hz)
+        newtons, temperature_k, ups_hz = (
+            None if array is None else self.place_counts(array)
+            for array in (vendor.newtons, vendor.temperature_k, vendor.ups_hz)
         )
-        return VendorReading(newtons, temperature_k, ups_hz)
+        return VendorReading(None if newtons is None else self.correct(newtons), temperature_k, ups_hz)
 
 
 def placed_map(model: ModelMap, mountings: Mapping[str, Mounting], prefix: str = "") -> ModelMap:
