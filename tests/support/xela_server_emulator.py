@@ -59,7 +59,7 @@ class ServerEmulator:
             for track in recording.tracks
         ]
         self._port = 0
-        self._clients: set[ServerConnection] = set()
+        self.clients: set[ServerConnection] = set()  # that are connected
         self._answers = threading.Event()
         self._answers.set()
 
@@ -76,7 +76,7 @@ class ServerEmulator:
         """End as a killed process does: connections break, and the port is closed."""
         self._server.shutdown()
         self._thread.join()
-        for client in list(self._clients):
+        for client in list(self.clients):
             client.close_socket()
 
     def start_again(self) -> None:
@@ -101,13 +101,13 @@ class ServerEmulator:
 
     def say(self, text: str | bytes) -> None:
         """Send any text or bytes to every client; bytes as a binary message."""
-        wait_for(lambda: self._clients)
-        for client in list(self._clients):
+        wait_for(lambda: self.clients)
+        for client in list(self.clients):
             client.send(text)
 
     def close_all(self, code: int, reason: str) -> None:
         """Close every connection politely, and go on listening."""
-        for client in list(self._clients):
+        for client in list(self.clients):
             client.close(code, reason)
 
     def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
@@ -126,14 +126,14 @@ class ServerEmulator:
         played_s = math.inf if self._loop else max(len(counts) / rate_hz for counts, rate_hz in self._sensors)
         with suppress(ConnectionClosed):
             client.send(json.dumps({"message": WELCOME, "time": time.time(), "version": "1.8.0b_208601"}))
-            self._clients.add(client)
+            self.clients.add(client)
             while ticks / self._message_hz < played_s:
                 time.sleep(max(0.0, start_s + ticks / self._message_hz - time.monotonic()))
                 self._answers.wait()
                 client.send(self.message(ticks, ticks / self._message_hz, time.time()))
                 behind = math.floor((time.monotonic() - start_s) * self._message_hz) - ticks
                 ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
-        self._clients.discard(client)
+        self.clients.discard(client)
 
 
 def sensor_entry(counts: np.ndarray = REST_COUNTS, *, ups=100.0, time_s=UNIX_S, **changes) -> dict:
