@@ -78,6 +78,7 @@ class ServerEmulator:
         self._thread.join()
         for client in list(self.clients):
             client.close_socket()
+        wait_for(lambda: not self.clients)
 
     def start_again(self) -> None:
         """Listen again after `kill`, on the same port; messages are counted from 0."""
@@ -109,6 +110,7 @@ class ServerEmulator:
         """Close every connection politely, and go on listening."""
         for client in list(self.clients):
             client.close(code, reason)
+        wait_for(lambda: not self.clients)
 
     def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
         """Return the message on all sensors at a time in [s] from its start, `unix_s` [s] on its own clock."""
