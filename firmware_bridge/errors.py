@@ -1,16 +1,5 @@
 """Errors of the bridge, and the message where an optional dependency, an extra of pyproject.toml, is missing.
 
-BridgeError
-+-- DeviceError (OSError)
-|   +-- NoDeviceError          no adapter, or several without a choice
-|   +-- LinkLostError          the link was there and is gone
-+-- BaselineRefusedError (ValueError)  the pad moved or was loaded while zeroing
-+-- RecordingError (ValueError)        a recording or baseline file that cannot be used
-+-- NpzError (ValueError)              an npz file that is not plain arrays
-+-- CdrError (ValueError)              bytes that are no ROS message of their type
-+-- SensorFileError (ValueError)       a sensor file that cannot be used
-+-- SourceError (ValueError)           a text that names no source
-
 Bad frames, skipped bytes and torn scans are counted, never raised.
 """
 
@@ -24,10 +13,7 @@ _FOLDER = Path(__file__).resolve().parent.parent
 
 
 def harmless(text: str, kept: str = "\n\t") -> str:
-    """Return text of a file, device or model without control characters, which could move a terminal's cursor.
-
-    What is not printable is escaped, but for `kept`; the result can be encoded, also of a file name that is not UTF-8.
-    """
+    """Return a stranger's text with escapes for what is not printable, but for `kept`; it can always be encoded."""
     if text.isprintable():
         return text
     return "".join(letter if letter.isprintable() or letter in kept else _escaped(letter) for letter in text)
@@ -39,10 +25,7 @@ def _escaped(letter: str) -> str:
 
 
 def as_typed(text: object) -> str:
-    """Return a name as a person types it in a command, quoted where a shell needs that; it holds no control characters.
-
-    What is not printable is an escape of bash's $'...'.
-    """
+    """Return a name as a person types it in a command, quoted where a shell needs that, or as bash's $'...'."""
     name = str(text)
     if name.isprintable():
         return quote(name)
@@ -106,20 +89,13 @@ def interrupted(error: BaseException | None) -> bool:
 
 
 def how_to_install(extra: str) -> str:
-    """Return the command that installs an extra of pyproject.toml, for the message that it is missing.
-
-    Of an installed wheel pip needs its name alone, wherever it came from: it adds what the extra lacks.
-    """
+    """Return the command that installs an extra of pyproject.toml, in a checkout or beside an installed wheel."""
     where = _FOLDER if (_FOLDER / "pyproject.toml").is_file() else "tactile-edge-sr"
     return f"pip install {as_typed(f'{where}[{extra}]')}"
 
 
 def need(extra: str, *modules: str) -> None:
-    """Refuse to import a package with a missing extra; a command ends with this message alone.
-
-    Raises:
-        ModuleNotFoundError: modules of the extra are not installed.
-    """
+    """Raise a ModuleNotFoundError if modules of an extra are missing; a command ends with its message alone."""
     missing = [name for name in modules if find_spec(name) is None]
     if not missing:
         return

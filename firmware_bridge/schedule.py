@@ -10,8 +10,7 @@ from typing import Final
 
 LAST_TIME_NS: Final = 1 << 60  # latest time in a recording, in [ns] (36 years): sums of two times stay below 2^63
 NS_PER_S: Final = 1_000_000_000
-POSITIVE: Final = (1e-9, 1e9)
-"""Range of a positive number that a user gives: times and rates beyond it have no use, and no room in nanoseconds."""
+POSITIVE: Final = (1e-9, 1e9)  # positive numbers that a user may give: others have no use, and no room in nanoseconds
 
 Clock = Callable[[], int]  # clock of monotonic time, in [ns]
 Sleep = Callable[[float], object]  # function that sleeps for a time in [s]; may return early or late
@@ -46,34 +45,26 @@ class Ticker:
 
 SLOWEST_PERIOD_NS: Final = 250_000_000  # time between two scans of the slowest sensor on record, in [ns]
 
-# ---- A sensor ----
+# ---- A sensor: times after which something happens ----
 
+# Without a scan a sensor is reported silent, if another one goes on; without a pose, after one that does not hold, its
+# source is: some scans were without one by then.
 SENSOR_SILENT_NS: Final = 2 * SLOWEST_PERIOD_NS
-"""Time without a scan after which a sensor is reported silent, if another one goes on, and drawn grey; and time without
-a pose, after one that does not hold, after which their source is: some scans were without one by then."""
-TAPS_FORGOTTEN_NS: Final = 4 * SLOWEST_PERIOD_NS
-"""Time without a scan after which earlier taps are dropped: a tap is over by then."""
-SERVER_READING_OLD_NS: Final = 4 * SLOWEST_PERIOD_NS
-"""Age at which a reading from the vendor's server belongs to a silent sensor."""
+TAPS_FORGOTTEN_NS: Final = 4 * SLOWEST_PERIOD_NS  # without a scan: earlier taps are dropped, as a tap is over by then
+SERVER_READING_OLD_NS: Final = 4 * SLOWEST_PERIOD_NS  # age of a reading of the vendor's server: its sensor is silent
 TAXEL_SILENT_SCANS: Final = 50  # scans without a taxel after which its loss is reported, and zeroing goes on without it
 LATEST_SCAN_S: Final = 2.0  # age of the last scan at the end of its watch above which the doctor reports a sensor
 
 # ---- A link ----
 
-LINK_SILENT_S: Final = 0.7
-"""Time without a scan after which a link is opened again: a little more than a sensor's silence, which must not."""
-ADAPTER_ASKED_NS: Final = 500_000_000
-"""Time without a scan after which an adapter's status, which can explain the silence, is requested."""
+LINK_SILENT_S: Final = 0.7  # without a scan, after which a link is opened again: a little more than a sensor's silence
+ADAPTER_ASKED_NS: Final = 500_000_000  # without a scan: an adapter's status, which can explain it, is requested
 
 # ---- A person, or a program that waits ----
 
-SHOWN_SILENT_S: Final = 1.0
-"""Time without a scan after which the status line and the diagnostics report it, in [s]: below, they would flicker."""
-SHOWN_AT_REST_S: Final = 0.1
-"""Longest time for which the scans of sensors at rest may wait until a person sees them, in [s]: the status line is
-rewritten as seldom."""
-GIVEN_UP_S: Final = 10.0
-"""Time without a scan after which zeroing and the doctor give up: a sensor just plugged in has come by then."""
+SHOWN_SILENT_S: Final = 1.0  # without a scan: status line and diagnostics report it; below, they would flicker
+SHOWN_AT_REST_S: Final = 0.1  # for which scans at rest may wait: the status line is rewritten as seldom
+GIVEN_UP_S: Final = 10.0  # without a scan: zeroing and the doctor give up; a sensor just plugged in has come by then
+# Longest time until a stop, a command or a silent link is noticed: waits for scans are cut in such pieces. Scans at
+# rest come more often, so that these waits seldom end before them: each end wakes two threads.
 POLL_S: Final = 0.25
-"""Longest time until a stop, a command or a silent link is noticed, in [s]: waits for scans are cut in such pieces.
-Scans at rest come more often, so that these waits seldom end before them: each end wakes two threads."""

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 LARGEST: Final = 1e12  # largest magnitude of a number in the file; a whole number can have more digits than any float
-LEAST_POSITIVE: Final = 1e-300
-"""Least number above 0: much smaller ones count as 0 where a library has made the processor faster."""
 
 
 class Table:

@@ -22,7 +22,7 @@ from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped, with_recorded
 from edge.validation import check_kind, check_positive
-from firmware_bridge.links.registry import place_recordings, recording_paths
+from firmware_bridge.links.registry import recording_paths
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44, pad_of
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track, check_raw
 from firmware_bridge.scans.mounting import Mounting
@@ -123,7 +123,7 @@ def open_recording(
     entries = {
         name: replace(stored.sensors.get(name, as_wired), baseline=baselines.get(name)) for name in sorted(sensors)
     }
-    place_recordings(replay, file.mountings)
+    replay.place(file.mountings)
     return Source(replay, sensor_file=replace(stored, sensors=entries), rate_hz=rate_hz)
 
 

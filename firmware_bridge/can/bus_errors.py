@@ -1,6 +1,5 @@
-"""State of a CAN controller, by the error frames that it sends. No I/O, no clock.
+"""State of a CAN controller, by the error frames by which it, and not the bus, reports an event. No I/O, no clock.
 
-An error frame does not come from the bus: the controller creates it to report an event.
 Source: Linux include/uapi/linux/can/error.h, whose bits socketcan and gs_usb adapters share.
 """
 
@@ -71,11 +70,7 @@ class BusErrors:
         return "; ".join(troubles) or None
 
     def counters(self) -> dict[str, int]:
-        """Return the counters by name.
-
-        bus_off, error_passive: times that the controller entered the state; overflows: times that it, or the adapter's
-        queue, had no room for a frame.
-        """
+        """Return how often the controller entered each state, and how often it, or the adapter's queue, had no room."""
         return dict(self._counts)
 
     def _enter(self, state: str) -> None:

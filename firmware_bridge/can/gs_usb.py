@@ -29,7 +29,6 @@ LIMITS_BYTES: Final = 40
 HARDWARE_STAMPS: Final = 1 << 4
 
 RECEIVED: Final = 0xFFFFFFFF
-ECHO_IDS: Final = 10  # most frames under way to the bus at once, as in Linux; their echo ids are 0..9
 
 OVERFLOW_FLAG: Final = 1 << 0
 FD_FLAG: Final = 1 << 1
@@ -42,8 +41,7 @@ _HIGHEST_EXTENDED: Final = 0x1FFFFFFF
 HEADER_BYTES: Final = 12
 FRAME_BYTES: Final = 20
 
-_SAMPLE_POINTS: Final = (0.75, 0.90)
-"""Range of sample points within which a bus of usual length works. Source: CiA 301, recommended bit timing."""
+_SAMPLE_POINTS: Final = (0.75, 0.90)  # within which a bus of usual length works. Source: CiA 301, bit timing
 
 _header = struct.Struct("<IIBBBB")
 _frame = struct.Struct("<IIBBBB8s")
@@ -97,10 +95,7 @@ class BitTiming(NamedTuple):
 
 
 def bit_timing(limits: BitTimingLimits) -> BitTiming:
-    """Return the timing for 1 Mbit/s of the finest quanta that allow a usual sample point, 87.5 % or a little less.
-
-    It raises ValueError if this controller cannot do it.
-    """
+    """Return the timing for 1 Mbit/s of the finest quanta that allow a usual sample point, or raise a ValueError."""
     clocks, rest = divmod(limits.clock_hz, BITRATE_BIT_S)
     for brp in range(max(limits.brp_min, 1), min(limits.brp_max, clocks) + 1, max(limits.brp_inc, 1)):
         quanta, uneven = divmod(clocks, brp)
@@ -129,24 +124,17 @@ def mode(*, started: bool, features: int = 0) -> bytes:
 
 
 def encode_frame(frame: CanFrame, echo_id: int) -> bytes:
-    """Encode a standard data frame to send on channel 0; `echo_id`, below ECHO_IDS, comes back once it has gone out."""
+    """Encode a standard data frame to send on channel 0; `echo_id`, below 10, comes back once it has gone out."""
     return _frame.pack(echo_id, frame.can_id, len(frame.data), 0, 0, 0, frame.data)
 
 
 class HostFrame(NamedTuple):
-    """Frame received from the adapter: one from the bus, or an error frame.
+    """Frame received from the adapter: one from the bus, or an error frame."""
 
-    Attributes:
-        frame: the frame as it was on the bus; only the data of an error frame have a meaning.
-        error: the error classes of an error frame, None for a frame from the bus.
-        stamp_us: time by the adapter's clock, which wraps round after 32 bits, in [us]; None if it has no clock.
-        overflow: True where frames before this one were lost, since the adapter's queue was full.
-    """
-
-    frame: CanFrame
-    error: int | None
-    stamp_us: int | None
-    overflow: bool
+    frame: CanFrame  # as it was on the bus; only the data of an error frame have a meaning
+    error: int | None  # error classes of an error frame, None for a frame from the bus
+    stamp_us: int | None  # time by the adapter's clock, which wraps round after 32 bits, in [us]
+    overflow: bool  # True where frames before this one were lost, since the adapter's queue was full
 
 
 class GsUsbDecoder:

@@ -1,25 +1,16 @@
 """Decoder and encoder of CAN frames as slcan text. No I/O.
 
-A line ends at CR (or at BEL, an adapter's refusal). Within a line the frame is the text from the
-LAST frame letter (t T r R) to the CR: hex digits hold no such letter, so a letter in mid-line is
-the start of a whole frame after the remains of another, or after noise. That text must fit its own
-length digit exactly, or the line gives no frame.
+A line ends at CR, or at BEL, an adapter's refusal. Its frame is the text from the LAST frame letter (t T r R) to the
+CR: hex digits hold no such letter, so one in mid-line begins a whole frame after the remains of another, or after
+noise. That text must fit its own length digit exactly, or the line gives no frame.
 
-An adapter stamps either every line with a time or no line. The decoder learns the form from LINES_TO_LEARN
-frames in a row of one form; from then on a frame of the other form is a bad line, until as many of those come
-in a row. So four data digits lost from a stamped line make no false frame without a stamp. Before a form is
-learnt, both are accepted.
+An adapter stamps either every line with a time or no line. The decoder learns the form from LINES_TO_LEARN frames in a
+row of one form; from then on a frame of the other form is a bad line, until as many of those come in a row. So four
+data digits lost from a stamped line make no false frame without a stamp. Before a form is learnt, both are accepted.
 
-A prefix cannot harm the frame after it, which is checked as if it stood alone. A data digit corrupted
-INTO a letter starts a false frame, but too few characters follow it for eight data bytes; only the
-length digit of a stamped line leaves enough, and that false frame has no stamp.
-
-Of an adapter's own lines it takes eight flags in answer to `F`, which the request clears (Lawicel CAN232 manual,
-version 3). EasySYNC adapters answer without the F: that is a bad line.
-
-The limit: slcan has no checksum on the serial leg. A flipped hex digit, and a loss of exactly one
-line's length across two lines (the head of one frame with the tail of the next), give a well-formed
-frame that was never sent. The text does not show it. Such a value lasts for one scan.
+The limit: slcan has no checksum on the serial leg. A flipped hex digit, and a loss of exactly one line's length across
+two lines (the head of one frame with the tail of the next), give a well-formed frame that was never sent. Such a value
+lasts for one scan.
 """
 
 import re
@@ -31,14 +22,13 @@ BITRATE_1M: Final = b"S8\r"
 OPEN: Final = b"O\r"
 STAMPS_ON: Final = b"Z1\r"
 STAMPS_OFF: Final = b"Z0\r"
-STATUS_FLAGS: Final = b"F\r"
+STATUS_FLAGS: Final = b"F\r"  # answered by eight flags, and clears them. Source: Lawicel CAN232 manual, version 3
 BUS_FLAGS: Final = 0xA0  # flags of errors on the bus, and of a controller that these have made passive
 
 LONGEST_LINE: Final = 30  # most characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp
 LAST_TIMESTAMP_MS: Final = 59_999  # where the clock starts anew each minute; some adapters count to 65,535
 
-LINES_TO_LEARN: Final = 4
-"""Frames in a row of one form after which it is learnt: damage to lines does not make so many of them."""
+LINES_TO_LEARN: Final = 4  # frames in a row of one form after which it is learnt: damage does not make so many
 
 PACKED_BYTES: Final = 10  # bytes of a usual frame packed: twelve bits of id, four of length (8), eight bytes of data
 STAMPED_BYTES: Final = 12  # bytes of a usual frame packed with two bytes of time stamp, in [ms]
@@ -83,29 +73,17 @@ class PackedFrames(NamedTuple):
 
 
 class SlcanDecoder:
-    """Decoder of a byte stream into frames. Any chunking gives the same frames and the same counters.
-
-    Attributes:
-        flags: flags that the adapter has answered last.
-        status_answers: number of these answers so far.
-        frames: number of frames so far, of any kind.
-        usual_line_bytes: length of a usual frame's line as the adapter sends it, with its CR; that of the shorter
-            form until the form is learnt.
-    """
+    """Decoder of a byte stream into frames. Any chunking gives the same frames and the same counters."""
 
     def __init__(self) -> None:
-        self.flags = self.status_answers = 0
-        self.usual_line_bytes = _FORMS[False].line_bytes
+        self.flags = self.status_answers = 0  # what the adapter has answered last, and how often
+        self.usual_line_bytes = _FORMS[False].line_bytes  # of a frame, with its CR; until learnt, the shorter
         self._form: _Form | None = None
         self._newest_stamped = False
         self._same_in_a_row = 0
         self._pending = b""
-        self.frames = 0
-        self._bad_lines = 0
-        self._non_ascii_lines = 0
-        self._skipped_bytes = 0
-        self._replies = 0
-        self._refusals = 0
+        self.frames = self._bad_lines = self._non_ascii_lines = 0
+        self._skipped_bytes = self._replies = self._refusals = 0
 
     def begin_anew(self) -> None:
         """Discard an unfinished line and the learnt form: the link broke, and the next bytes belong to neither."""
@@ -117,8 +95,7 @@ class SlcanDecoder:
     def cut(self, data: bytes) -> list[PackedFrames | CanFrame]:
         """Decode the frames whose last byte lies in `data`; the bytes after them wait for the next call.
 
-        Those of the usual form are packed, run by run, once that form is learnt. A sensor sends no other form, and a
-        run of sixteen costs about as much as a single frame.
+        Those of the usual form are packed, run by run, once that form is learnt: sixteen cost about as much as one.
         """
         buffer = self._pending + data
         pieces: list[PackedFrames | CanFrame] = []

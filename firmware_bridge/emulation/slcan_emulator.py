@@ -27,21 +27,17 @@ FRAME_S: Final = 0.000_13  # duration of a frame of eight bytes on a 1 Mbit/s bu
 
 CR: Final = b"\r"
 BEL: Final = b"\a"
-Played = Callable[[Track], Iterable[NDArray[np.int32]]]
-"""Function from a track to the scans that are played of it, in order."""
+Played = Callable[[Track], Iterable[NDArray[np.int32]]]  # from a track to the scans that are played of it
 
 
 def scan_frames(counts: NDArray[np.int32], controller: int, model: ModelMap = USPA44_MAP) -> list[CanFrame]:
-    """Encode one scan (3, rows, cols) as a controller does: a frame per taxel, by SDA, then by taxel on it.
-
-    Absent taxels have no frame. The bytes that carry no reading are as in a real frame, not zero.
-    """
+    """Encode one scan (3, rows, cols) as a controller does: a frame per taxel that is not absent, in wire order."""
     frames: list[CanFrame] = []
     by_taxel = counts.reshape(3, -1).T.tolist()
     for can_id, taxel in model.wire_order(str(controller)):
         x, y, z = by_taxel[taxel]
         if x != ABSENT:
-            frames.append(CanFrame(can_id, struct.pack(">B3HB", 0x93, x, y, z, 0x0F)))
+            frames.append(CanFrame(can_id, struct.pack(">B3HB", 0x93, x, y, z, 0x0F)))  # unused bytes are not zero
     return frames
 
 
@@ -55,13 +51,9 @@ class Controller(NamedTuple):
 
 
 def controllers_of(recordings: Sequence[Recording], rate_hz: float | None) -> list[Controller]:
-    """Create the controllers 4, 6, 8, ... that play these recordings on one bus: each track is one.
+    """Create the controllers 4, 6, 8, ..., at most six, that play these recordings on one bus: each track is one.
 
-    Their rates are by default as recorded.
-
-    Raises:
-        ValueError: the rate is invalid, or there are more than six.
-        RecordingError: a recording that this sensor cannot have made, or one without a rate.
+    Raises RecordingError for a recording that this sensor cannot have made, or one without a rate.
     """
     tracks = [(recording, track) for recording in recordings for track in recording.tracks]
     if len(tracks) > 6:
@@ -77,10 +69,7 @@ def controllers_of(recordings: Sequence[Recording], rate_hz: float | None) -> li
 
 
 def playing_rate_hz(recording: Recording, track: Track, rate_hz: float | None) -> float:
-    """Return the scans a second at which a track is played: the requested ones, else as recorded.
-
-    It raises ValueError unless that is positive, and RecordingError where none is recorded.
-    """
+    """Return the scans a second at which a track is played: the requested ones, else as recorded."""
     rates_hz = [rate for rate in (rate_hz, recording.rate_hz, track.mean_rate_hz) if rate is not None]
     if not rates_hz:
         raise RecordingError(f"{recording.path} does not state its rate: pass --rate-hz")
@@ -111,17 +100,11 @@ def _lane(controller: Controller, loop: bool, frame_s: float, played: Played) ->
 
 
 class SlcanAdapter:
-    """Emulated adapter that obeys slcan commands as strictly as a real one.
-
-    Attributes:
-        channel_open: True while it passes on the frames of the bus.
-        flags: flags that `F` reports, Lawicel's bits; the report clears them.
-    """
+    """Emulated adapter that obeys slcan commands as strictly as a real one."""
 
     def __init__(self) -> None:
         """Switch the adapter on."""
-        self.flags = 0
-        self.channel_open = False
+        self.channel_open = False  # True while it passes on the frames of the bus
         self._bitrate: int | None = None
         self._timestamps = False
         self._pending = b""
@@ -152,14 +135,9 @@ class SlcanAdapter:
 
     def _obey(self, command: bytes) -> bytes:
         name, value = command[:1], command[1:]
-        if name == b"t" and self.channel_open:
-            return b"z" + CR
-        if name == b"V" and not value:
-            return b"V1013" + CR
         if self.channel_open:
             if command == b"F":
-                flags, self.flags = self.flags, 0
-                return b"F%02X" % flags + CR
+                return b"F00" + CR  # no error flag
             if command != b"C":
                 return BEL
             self.channel_open = False
@@ -175,14 +153,7 @@ class SlcanAdapter:
 
 
 class Emulator:
-    """Player of recordings on `port`, from the first opening of the channel; hangs up at the end.
-
-    Attributes:
-        port: path for clients, once entered.
-        adapter: the adapter, with its state and the number of refused commands.
-        line: this end of the pseudo-terminal.
-        played_out: True once everything was played, and the client has fetched it.
-    """
+    """Player of recordings on `port`, from the first opening of the channel; hangs up at the end."""
 
     def __init__(
         self,
@@ -197,26 +168,16 @@ class Emulator:
         waits: bool = False,
         played: Played = attrgetter("counts"),
     ) -> None:
-        """Prepare to play; nothing is opened yet.
+        """Prepare to play each track of `recordings` as one sensor, as `controllers_of`; nothing is opened yet.
 
-        Args:
-            recordings: each track is one sensor on the bus.
-            rate_hz: scans a second of each sensor; by default as recorded.
-            loop: True to begin again after the last scan.
-            adapter: the adapter, by default a good one.
-            frame_s: duration of a frame on the bus, in [s]; a real one carries no more than 480 scans a second.
-            on_scan: called with the controller and the monotonic time in [ns] of the last frame of a scan.
-            link: link that points to the pseudo-terminal; by default clients use the terminal itself.
-            waits: True to wait for a client that reads late, as no bus does, so that no frame is lost.
-            played: scans that are played of a track; each is asked for while the one before is sent.
-
-        Raises:
-            ValueError: the rate is out of range.
-            RecordingError: a recording that this sensor cannot have made, or one without a rate.
+        `frame_s` is the duration of a frame on the bus, in [s]. `on_scan` is called with the controller and the
+        monotonic time in [ns] of the last frame of a scan. `link` becomes a link to the pseudo-terminal. With `waits`
+        no frame is lost where a client reads late, unlike on a bus. Scans that are `played` of a track are each asked
+        for while the one before is sent.
         """
         bus = controllers_of(recordings, rate_hz)
-        self.port = ""
-        self.played_out = False
+        self.port = ""  # path for clients, once entered
+        self.played_out = False  # True once everything was played, and the client has fetched it
         self.adapter = SlcanAdapter() if adapter is None else adapter
 
         self._timeline = bus_timeline(bus, loop=loop, frame_s=frame_s, played=played)
@@ -226,7 +187,7 @@ class Emulator:
         self._waits = waits
         self._still_s = 0.0
         self._unsent = b""
-        self.line = PseudoPort(link)
+        self.line = PseudoPort(link)  # this end of the pseudo-terminal
 
         self._alone = EmulatorThread([self])
 

@@ -1,8 +1,7 @@
-"""Interface of every link, and the reader of one for its source.
+"""Interface of every link, and the reader that opens one again when it is lost or silent.
 
-A new link is one file with this interface, and its form in the registry (`registry.py`). The reader opens a link again
-when it is lost or silent, and tells what happened to it; it is also the border where the errors of drivers and of
-network libraries stop: each is the loss of one link.
+A new link is one file with this interface, and its form in the registry (`registry.py`). The reader is also the border
+where the errors of drivers and of network libraries stop: each is the loss of one link.
 """
 
 import time
@@ -23,31 +22,22 @@ from firmware_bridge.schedule import LINK_SILENT_S
 SourceKind = Literal["device", "replay", "emulated"]
 NoticeKind = Literal["lost", "silent", "back", "trouble", "well", "note"]
 
-SOON_RETRY_S: Final = 0.5
-"""Pause between tries in the first minute, in [s]: with the opening, a link that is back is used within 1 s."""
+SOON_RETRY_S: Final = 0.5  # pause between tries in the first minute: a link that is back is used within 1 s
 LATE_RETRY_S: Final = 2.0
-SOON_S: Final = 60.0
-"""Time of an outage with frequent tries, in [s]; later ones are rarer, to save the robot's processor."""
+SOON_S: Final = 60.0  # time of an outage with frequent tries; later ones are rarer, to save the robot's processor
 
 _Answer = TypeVar("_Answer")
 
 
 class Notice(NamedTuple):
-    """Message of a link in addition to its scans.
+    """Message of a link in addition to its scans."""
 
-    Attributes:
-        time_ns: monotonic time, in [ns].
-        kind: "lost", the link is gone; "silent", it is there and gives no scan; "back", it gives scans again, and
-            all earlier readings of its sensors are old; "trouble", it works, but reports trouble; "well", it no
-            longer does; "note", a remark on a recording or on time stamps.
-        text: message to the user.
-        sensors: common prefix of the names of the sensors concerned.
-    """
-
-    time_ns: int
+    time_ns: int  # monotonic time, in [ns]
+    # "silent": it is there and gives no scan; "back": it gives scans again, and all earlier readings are old;
+    # "trouble": it works, but reports trouble; "well": it no longer does; "note": a remark, as on time stamps
     kind: NoticeKind
-    text: str
-    sensors: str = ""
+    text: str  # message to the user
+    sensors: str = ""  # common prefix of the names of the sensors concerned
 
 
 class Link(Protocol):
@@ -55,57 +45,34 @@ class Link(Protocol):
 
     A link opens on `__enter__` and closes on `__exit__`. One that was lost may be opened again after it was closed,
     any number of times: it then searches for its device again, and discards open scans.
-
-    Attributes:
-        name: the source as a user would write it, such as "slcan:/dev/ttyUSB0".
-        kind: "device" for hardware, "replay" for a file, "emulated" for an emulated device.
-        ended: True once a finite source has no more scans.
-        trouble: trouble of the device to report to the user; None if there is none.
-        stamps_dropped: True once the device's time stamps have shown that they are no clock.
-        patient: True where the link waits for its reader, and returns one scan for each `read`, whatever its time.
-        unix_offset_ns: offset from the times of a patient link's scans to [ns] since 1970; None if it is not available.
-        origin: kind of source of a recording's scans, however often it was played and recorded again; None if it is
-            not available, or equals `kind`.
-        length_s: length of a recording, in [s]; None of anything else.
-        mountings: mountings of the sensors whose scans come with their taxels in place, as in a recording.
-        states_poses: True where poses of the sensors come with the scans.
-        prefix: beginning of the names of all its sensors: what the user calls it, and a slash.
-        lasts: True where it is opened again after a loss; a recording, or a demo, is over then.
-        fetches: True if the system keeps for a while what is not read, and `fetch` takes it.
     """
 
-    name: str
+    name: str  # the source as a user would write it, such as "slcan:/dev/ttyUSB0"
     kind: SourceKind
-    ended: bool = False
-    trouble: str | None = None
-    stamps_dropped: bool = False
-    patient: bool = False
-    unix_offset_ns: int | None = None
+    ended: bool = False  # True once a finite source has no more scans
+    trouble: str | None = None  # trouble of the device to report to the user
+    stamps_dropped: bool = False  # True once the device's time stamps have shown that they are no clock
+    patient: bool = False  # True where it waits for its reader, and each `read` returns one scan, whatever its time
+    unix_offset_ns: int | None = None  # offset from the times of a patient link's scans to [ns] since 1970
+    # Kind of source of a recording's scans, however often it was played and recorded again; None if it equals `kind`.
     origin: SourceKind | None = None
-    length_s: float | None = None
-    mountings: Mapping[str, Mounting] = MappingProxyType({})
-    states_poses: bool = False
-    prefix: str = ""
-    lasts: bool = True
-    fetches: bool = False
+    length_s: float | None = None  # length of a recording, in [s]
+    mountings: Mapping[str, Mounting] = MappingProxyType({})  # of sensors whose taxels are in place already
+    states_poses: bool = False  # True where poses of the sensors come with the scans
+    prefix: str = ""  # beginning of the names of all its sensors: what the user calls it, and a slash
+    lasts: bool = True  # True where it is opened again after a loss; a recording, or a demo, is over then
+    fetches: bool = False  # True if the system keeps for a while what is not read, and `fetch` takes it
 
     def __enter__(self) -> "Link": ...
 
     def __exit__(self, *exc_info: object) -> None: ...
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; waits at most `timeout_s` for the first.
-
-        Raises:
-            LinkLostError: the link was there and is gone.
-        """
+        """Return the scans that closed since the last call; wait at most `timeout_s`; raise a LinkLostError if gone."""
         ...
 
     def fetch(self) -> None:
-        """Take what the system has received, without waiting; the next `read` makes scans of it.
-
-        The thread that reads may call it, as often as it likes, where `fetches` is True.
-        """
+        """Take what the system has received, without waiting; the next `read` of the same thread makes scans of it."""
 
     def notices(self) -> list[Notice]:
         """Return the notices since the last call, all from before the scans that the last `read` returned."""
@@ -133,19 +100,14 @@ def not_open() -> ValueError:
     return ValueError("the link is not open: use it in a with statement")
 
 
-LONG_UNREAD_NS: Final = 50_000_000
-"""Time without a read from which the process counts as stalled, in [ns]: more than twice the longest wait of a link."""
+LONG_UNREAD_NS: Final = 50_000_000  # without a read the process counts as stalled: over twice the longest wait
 
 
 class Unread:
-    """Tracker of the latest time at which a link was empty.
-
-    Attributes:
-        empty_ns: latest monotonic time at which its reader saw it empty, in [ns]; None before that.
-    """
+    """Tracker of the latest time at which a link was empty."""
 
     def __init__(self) -> None:
-        self.empty_ns: int | None = None
+        self.empty_ns: int | None = None  # latest monotonic time at which its reader saw it empty, in [ns]
         self._stall_ns = 0, 0
 
     def note_data(self, begun_ns: int, ended_ns: int) -> None:
@@ -175,13 +137,7 @@ class Unread:
 
 
 class LinkReader:
-    """Reader that opens its link again whenever it is lost, and now and then while it is silent.
-
-    Attributes:
-        link: the link.
-        outages: number of losses and silences so far.
-        reopenings: number of times that it was opened again.
-    """
+    """Reader that opens its link again whenever it is lost, and now and then while it is silent."""
 
     def __init__(
         self,
@@ -193,11 +149,11 @@ class LinkReader:
     ) -> None:
         """Prepare to read a link that is not open yet, and whose first opening must succeed.
 
-        `give_up_s` is the longest outage or silence, in [s]; 0 allows no outage, but any silence, as for a link that
-        does not last. `sleep` waits for a time in [s], and returns True where reading is to end.
+        `give_up_s` is the longest outage or silence, in [s]; 0 allows no outage, but any silence. `sleep` returns True
+        where reading is to end.
         """
         self.link = link
-        self.outages = self.reopenings = 0
+        self.outages = self.reopenings = 0  # losses and silences so far
         self._give_up_s = give_up_s if link.lasts else 0.0
         self._clock_ns, self._sleep = clock_ns, sleep
         self._entered = False
@@ -222,8 +178,7 @@ class LinkReader:
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; none while the link is away.
 
-        A link that is lost or silent is closed and opened again by the next call, which may take long. It raises
-        LinkLostError where it was away for longer than allowed.
+        One that is lost or silent is opened again by the next call; LinkLostError: it was away for longer than allowed.
         """
         if self._away or not self._entered:
             self._reopen()
@@ -254,7 +209,7 @@ class LinkReader:
         ]
 
     def counters(self) -> dict[str, int]:
-        """Return the link's counters; of one that lasts, also its outages (losses, silences) and reopenings."""
+        """Return the link's counters; of one that lasts, also its outages and reopenings."""
         losses = {"outages": self.outages, "reopenings": self.reopenings} if self.link.lasts else {}
         return self.link.counters() | losses
 

@@ -26,11 +26,7 @@ _NOT_THROUGH_PYTHON_CAN: Final = {
 
 
 class CanBusLink(FrameLink):
-    """Link to a sensor on an interface that python-can supports.
-
-    A wall clock that is set back while no frame comes makes `read` wait longer by that much, since python-can measures
-    its time-outs with it.
-    """
+    """Link to a sensor on an interface of python-can, whose time-outs grow where the wall clock is set back."""
 
     def __init__(
         self,
@@ -40,10 +36,9 @@ class CanBusLink(FrameLink):
         model: ModelMap = USPA44_MAP,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Prepare a link to a channel such as "can0" of a python-can interface such as "socketcan"; opens nothing yet.
+        """Prepare a link to a channel such as "can0" of an interface such as "socketcan"; opens nothing yet.
 
-        It raises SourceError for an interface that python-can or this link does not support, and DeviceError where
-        python-can is not installed.
+        Raises SourceError for an interface that is not supported, and DeviceError where python-can is not installed.
         """
         self._scans = FrameScans(model)
         super().__init__(self._scans, clock_ns)

@@ -16,11 +16,7 @@ from firmware_bridge.scans.scan import Scan
 
 
 class DemoLink(SlcanSerialLink):
-    """Link to a recording played by the emulator, over the ordinary serial path.
-
-    Attributes:
-        emulator: the emulator, once the link was open.
-    """
+    """Link to a recording played by the emulator, over the ordinary serial path."""
 
     def __init__(
         self, recording: str | Path, rate_hz: float | None = None, *, loop: bool = False, model: ModelMap = USPA44_MAP
@@ -30,7 +26,7 @@ class DemoLink(SlcanSerialLink):
         self.lasts = self.fetches = False
         self.kind: SourceKind = "emulated"
         self.states_poses = True  # those of its robot
-        self.emulator: Emulator | None = None
+        self.emulator: Emulator | None = None  # the emulator, once the link was open
         self._recording = Path(recording)
         self._rate_hz = rate_hz
         self._loop = loop

@@ -1,9 +1,6 @@
 """Discovery of devices that may lead to a sensor on this machine, and of their problems. Opens and sends nothing."""
 
-import json
 import os
-import shutil
-import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
@@ -24,12 +21,10 @@ class CanNetwork(NamedTuple):
 
     @property
     def problem(self) -> str | None:
-        """Message that the network is down, with the command that brings it up; None if it is up.
-
-        It sets restart-ms, since the kernel otherwise leaves a controller in bus-off.
-        """
+        """Message that the network is down, with the command that brings it up; None if it is up."""
         if self.up:
             return None
+        # Without restart-ms the kernel leaves a controller in bus-off.
         how = f" type can bitrate {BITRATE_BIT_S} restart-ms 100" if self.driver else ""
         return f"is down: sudo ip link set {as_typed(self.name)} up{how}"
 
@@ -112,12 +107,9 @@ def can_interfaces(sys_root: Path = SYS_ROOT) -> list[Found]:
     listed: list[Found] = []
     for network in can_networks(sys_root):
         name, driver = network.name, network.driver
-        problems = [] if network.problem is None else [network.problem]
-        bitrate = _bitrate_hz(name)
-        if bitrate not in (None, 0, BITRATE_BIT_S):
-            problems.append(f"runs at {bitrate} bit/s, the sensor at {BITRATE_BIT_S}")
+        problems = () if network.problem is None else (network.problem,)
         looks_like = f"CAN interface, {f'driver {driver}' if driver else 'virtual or of slcand'}"
-        listed.append(Found("socketcan", name, None, None, looks_like, True, f"can:socketcan:{name}", tuple(problems)))
+        listed.append(Found("socketcan", name, None, None, looks_like, True, f"can:socketcan:{name}", problems))
     return listed
 
 
@@ -148,16 +140,3 @@ def _by_place(path: str) -> str:
 
 def _usb_id(usb_id: tuple[int, int]) -> str:
     return f"{usb_id[0]:04x}:{usb_id[1]:04x}"
-
-
-def _bitrate_hz(name: str) -> int | None:
-    """Return the bitrate from `ip`, in [bit/s], since sysfs does not contain it; None if not available."""
-    ip = shutil.which("ip")
-    if ip is None:
-        return None
-    try:
-        command = [ip, "-json", "-details", "link", "show", name]
-        done = subprocess.run(command, capture_output=True, check=True, timeout=2.0)
-        return json.loads(done.stdout)[0]["linkinfo"]["info_data"]["bittiming"]["bitrate"]
-    except (OSError, subprocess.SubprocessError, ValueError, LookupError, TypeError):
-        return None

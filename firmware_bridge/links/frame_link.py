@@ -40,7 +40,7 @@ class FrameLink(Link):
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""
-        return self._stages.can_ids
+        return self._stages.assembler.can_ids
 
     def _fetch(self, timeout_s: float) -> Any:
         """Return the next piece, None if none came in time."""

@@ -27,8 +27,7 @@ INTERFACE: Final = 0
 CHANNEL: Final = 0
 ENDPOINT_IN: Final = 0x81
 REQUEST_TIMEOUT_MS: Final = 1000
-MOST_OLD_TRANSFERS: Final = 1000
-"""Most transfers drained from a stopped channel: its queue has 64, and one that goes on did not stop."""
+MOST_OLD_TRANSFERS: Final = 1000  # drained from a stopped channel: its queue has 64
 
 
 class GsUsbDevice(NamedTuple):
@@ -75,8 +74,7 @@ class GsUsbLink(FrameLink):
     ) -> None:
         """Prepare a link to the adapter with a serial number or at a place such as "1-2.3", for None the only one.
 
-        Once it was open, only that adapter is opened again, or with a place the one that is there. `backend` is one of
-        pyusb, by default libusb.
+        Once it was open, only that adapter is opened again, or with a place the one that is there.
         """
         self._scans = GsUsbScans(model)
         super().__init__(self._scans, clock_ns)
@@ -164,8 +162,7 @@ class GsUsbLink(FrameLink):
         self._unread.empty_ns = self._clock_ns()  # from here on: this thread may not run for long after the start
         _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):
-            data = gs_usb.encode_frame(frame, number % gs_usb.ECHO_IDS)
-            device.write(0x02, data, REQUEST_TIMEOUT_MS)
+            device.write(0x02, gs_usb.encode_frame(frame, number), REQUEST_TIMEOUT_MS)
 
     def _stop(self, device: usb.core.Device) -> None:
         _request(device, gs_usb.MODE, gs_usb.mode(started=False))
@@ -191,10 +188,9 @@ def gs_usb_devices(backend: IBackend | None = None) -> list[GsUsbDevice]:
 def find_gs_usb(
     wanted: str | None, recognised: Recognised[GsUsbDevice], backend: IBackend | None = None
 ) -> tuple[GsUsbDevice, usb.core.Device]:
-    """Return the adapter with a serial number or at a place such as "1-2.3", for None the only one, and learn it.
+    """Return the adapter that `GsUsbLink` wants, or that was `recognised` at an earlier opening, and learn it.
 
-    The one that was `recognised` at an earlier opening is found again, unless a place is wanted. Raises NoDeviceError
-    where there is no such adapter, or several, and DeviceError if USB cannot be read.
+    Raises NoDeviceError where there is no such adapter, or several, and DeviceError if USB cannot be read.
     """
     adapters = _adapters(backend)
     present = [described for described, _ in adapters]
@@ -224,10 +220,7 @@ def find_gs_usb(
 
 
 def source_name(device: GsUsbDevice, present: Sequence[GsUsbDevice]) -> str | None:
-    """Return the source that selects one of the present adapters: by serial number if that is its own, else by place.
-
-    None where it has neither.
-    """
+    """Return the source that selects a present adapter: by its own serial number, else by place; None without both."""
     serial_numbers = [adapter.serial_number for adapter in present]
     own = device.serial_number is not None and serial_numbers.count(device.serial_number) == 1
     name = device.serial_number if own else device.place

@@ -14,7 +14,6 @@ from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting, placed_map
 
 if TYPE_CHECKING:
-    from firmware_bridge.links.replay import ReplayLink
     from firmware_bridge.recording.tracks import Recording
 
 FORMS: Final = {
@@ -46,13 +45,8 @@ def open_sources(
     """Create the links that `texts` name, not yet entered; without any, that of the only known adapter.
 
     Each text is one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4", also in `mountings`. Among several
-    sources, those without a name are called by their place, source1 and so on. `rate_hz` is that at which recordings
-    are played, among them the demo's; a device has its own. Recordings of edge-sr are in place already.
-
-    Raises:
-        SourceError: no such form, or one name twice.
-        NoDeviceError: no adapter, or several without a choice.
-        RecordingError: a recording that cannot be used.
+    sources, those without a name are called by their place, source1 and so on. `rate_hz` is that of recordings.
+    Raises SourceError, NoDeviceError (or several without a choice), and RecordingError.
     """
     links: dict[str, Link] = {}
     for number, text in enumerate(texts or [None], 1):
@@ -103,7 +97,7 @@ def _link(
         from firmware_bridge.recording.formats import load_recording
 
         replay = ReplayLink([_named(load_recording(path), prefix) for path in recording_paths(rest)], rate_hz)
-        place_recordings(replay, mountings)
+        replay.place(mountings)
         return replay
     if text in ("demo", DEMO_LOOP) and demo_recording is not None:
         from firmware_bridge.links.demo import DemoLink
@@ -115,29 +109,6 @@ def _link(
 def recording_paths(text: str) -> list[str]:
     """Split FILE[,FILE] into paths; the name of a single existing file may have a comma in it."""
     return [text] if Path(text).exists() else text.split(",")
-
-
-def place_recordings(link: "ReplayLink", mountings: Mapping[str, Mounting]) -> None:
-    """Let a link put all taxels of its recordings in place: those of a CSV are as wired.
-
-    Raises:
-        SourceError: a CSV is of a pad with another number of taxels than its mounting.
-    """
-    raw = {
-        track.sensor: (recording.path, track)
-        for recording in link.recordings
-        if recording.path.suffix.lower() == ".csv"
-        for track in recording.tracks
-        if track.sensor in mountings
-    }
-    for sensor, (path, track) in raw.items():
-        taxels, expected = track.geometry.taxel_count, mountings[sensor].taxel_count
-        if taxels != expected:
-            raise SourceError(
-                f"{path} has {taxels} taxels, and in the sensor file sensor {sensor} has {expected}: leave out the "
-                "sensor file, or give that of this pad"
-            )
-    link.place({sensor: mountings[sensor] for sensor in raw})
 
 
 def _named(recording: "Recording", prefix: str) -> "Recording":

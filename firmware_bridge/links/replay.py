@@ -24,14 +24,7 @@ from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S, Clock, Sleep, sleep
 
 
 class ReplayLink(Link):
-    """Link to recordings, all started together. It never leaves a scan out; late ones come at once.
-
-    Attributes:
-        recordings: the recordings that it plays.
-        notes: remarks for the user, which become notices.
-        times_ns: times (n,) of each sensor's scans since the first scan, in [ns], by name.
-        first_ns: time of the first scan as it is played, in [ns].
-    """
+    """Link to recordings, all started together. It never leaves a scan out; late ones come at once."""
 
     def __init__(
         self,
@@ -47,12 +40,7 @@ class ReplayLink(Link):
 
         They are played by their recorded times, else at their recorded rate, or at `rate_hz` scans a second of each
         sensor. If `paced`, that is so from now on, or once `begins` is set; else each `read` returns a scan at its
-        recorded time.
-
-        Raises:
-            RecordingError: a file cannot be used.
-            SourceError: the rate is invalid, a file has neither times nor a rate, two files name the same sensor, or
-                some are of emulated sensors and some are not.
+        recorded time. Raises RecordingError, or SourceError where they cannot be played so, or not together.
         """
         if rate_hz is not None and not 0 < rate_hz < math.inf:
             raise SourceError(f"rate is {rate_hz} Hz, expected a positive number")
@@ -75,7 +63,7 @@ class ReplayLink(Link):
             if recording.mountings
             for track in recording.tracks
         }
-        self.notes: list[str] = []
+        self.notes: list[str] = []  # remarks for the user, which become notices
         self._begins = begins
         self._clock = clock
         self._sleep = sleep
@@ -85,6 +73,7 @@ class ReplayLink(Link):
             for track in recording.tracks
         ]
         self._tracks = [track for track, _ in lanes]
+        # Times (n,) of each sensor's scans since the first scan, in [ns].
         self.times_ns = {track.sensor: due_times_ns for track, due_times_ns in lanes}
         sensors = [track.sensor for track in self._tracks]
         if len(set(sensors)) < len(sensors):
@@ -102,7 +91,7 @@ class ReplayLink(Link):
         self._due_ns, self._lane, self._row = due_ns[order], lane[order], row[order]
         self._place = 0
         self.length_s = int(self._due_ns[-1]) / NS_PER_S
-        self.first_ns = _first_ns(self.recordings[0]) or 0
+        self.first_ns = _first_ns(self.recordings[0]) or 0  # time of the first scan as it is played, in [ns]
         if not paced:
             self.unix_offset_ns = self.recordings[0].unix_offset_ns
         self.notes += [note for recording in self.recordings for note in recording.notes]
@@ -135,13 +124,21 @@ class ReplayLink(Link):
         return scans
 
     def place(self, mountings: Mapping[str, Mounting]) -> None:
-        """Put the taxels of sensors that were recorded as wired in their places, by the mountings of these sensors."""
-        self._tracks = [
-            replace(track, counts=mountings[track.sensor].place_counts(track.counts))
-            if track.sensor in mountings
-            else track
-            for track in self._tracks
-        ]
+        """Put the taxels of each CSV, which are as wired, in their places; those of other files are there already.
+
+        Raises SourceError where a CSV is of a pad with another number of taxels than its mounting.
+        """
+        as_wired = [file for file in self.recordings if file.path.suffix.lower() == ".csv"]
+        paths = {track.sensor: file.path for file in as_wired for track in file.tracks if track.sensor in mountings}
+        for number, track in enumerate(self._tracks):
+            if track.sensor in paths:
+                mounting, taxels = mountings[track.sensor], track.geometry.taxel_count
+                if taxels != mounting.taxel_count:
+                    raise SourceError(
+                        f"{paths[track.sensor]} has {taxels} taxels, and in the sensor file sensor {track.sensor} has "
+                        f"{mounting.taxel_count}: leave out the sensor file, or give that of this pad"
+                    )
+                self._tracks[number] = replace(track, counts=mounting.place_counts(track.counts))
 
     def notices(self) -> list[Notice]:
         """Return the notes on the files, once."""

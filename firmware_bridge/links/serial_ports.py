@@ -127,14 +127,10 @@ _Device = TypeVar("_Device", bound=_UsbDevice)
 
 
 class Recognised(Generic[_Device]):
-    """Device that a link has opened, known by its identity, or by its place once two were seen to share that.
-
-    Attributes:
-        device: as it was seen last; None before, and without an identity.
-    """
+    """Device that a link has opened, known by its identity, or by its place once two were seen to share that."""
 
     def __init__(self) -> None:
-        self.device: _Device | None = None
+        self.device: _Device | None = None  # as it was seen last; None before, and without an identity
         self._shared = False
 
     def learn(self, device: _Device, present: Sequence[_Device]) -> None:
@@ -160,8 +156,8 @@ class Recognised(Generic[_Device]):
 class PluggedAdapter:
     """Adapter that is found again at any port by its USB serial number, unless the user named its place.
 
-    A name that is a link, such as those in /dev/serial/by-path, is a place, and is followed. One of the kernel's, such
-    as /dev/ttyUSB0, changes when a plug is pulled. Of a device with several ports it is always the same one.
+    A name that is a link, such as those in /dev/serial/by-path, is a place, and is followed; one of the kernel's, such
+    as /dev/ttyUSB0, changes when a plug is pulled.
     """
 
     def __init__(self, path: str) -> None:
@@ -172,8 +168,7 @@ class PluggedAdapter:
     def find(self, ports: Sequence[Port]) -> str:
         """Return the path of its port among the present ones, or the first path if it has no serial number.
 
-        Raises:
-            NoDeviceError: it is missing, or another one has the same identity.
+        Raises NoDeviceError where it is missing, or cannot be told from another one.
         """
         adapter = self._recognised.device
         if adapter is None or Path(self._path).is_symlink():
@@ -205,10 +200,8 @@ def holders(path: str) -> list[str]:
 
 
 def in_use(path: str) -> str:
-    """Return who holds a serial port, and what to do.
-
-    ModemManager is root's, so that nobody else sees what it holds; it tries each new port for some seconds.
-    """
+    """Return who holds a serial port, and what to do."""
+    # ModemManager is root's, so that nobody else sees what it holds; it tries each new port for some seconds.
     held = ", ".join(holders(path)) or "this program, or one of another user"
     return (
         f"in use by {held}: end the program that holds it, such as slcand, xela_server or another edge-sr. After a "

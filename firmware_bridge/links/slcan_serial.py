@@ -38,22 +38,18 @@ from firmware_bridge.schedule import ADAPTER_ASKED_NS
 
 DEFAULT_BAUD: Final = 3_000_000
 WRITE_TIMEOUT_S: Final = 1.0
-QUIET_S: Final = 0.02
-"""Silence after which the line counts as quiet, in [s]: a little over the 16 ms for which an FTDI chip holds bytes."""
+QUIET_S: Final = 0.02  # silence after which the line is quiet: a little over the 16 ms that an FTDI chip holds bytes
 LONGEST_SETTLE_S: Final = 0.3
 
-MOST_SILENT_OPENINGS: Final = 10
-"""Openings in a row without a scan after which stamps are not requested: a lasting link may reopen for days."""
+MOST_SILENT_OPENINGS: Final = 10  # in a row, after which stamps are not requested: a lasting link may reopen for days
 
 MOST_BYTES: Final = 65536  # most bytes read at once: as many as a kernel keeps for a serial port
 BYTE_S: Final = 5e-6  # time in [s] for a byte of a frame's line, of which a frame of 0.13 ms has 26 at most
 SHORTEST_SLEEP_S: Final = 0.0003
-LONGEST_WAIT_S: Final = 0.004
-"""Longest wait for the end of a scan after its first bytes, in [s]: sixteen frames take 2.1 ms on the bus."""
+LONGEST_WAIT_S: Final = 0.004  # for the end of a scan after its first bytes: sixteen frames take 2.1 ms on the bus
 LONGEST_LOOK_S: Final = 0.02  # longest time between two looks that find nothing, in [s]: `Unread` tells stalls by them
 
-ASKED_AGAIN_NS: Final = 5_000_000_000
-"""Time between two requests for the status flags of a silent adapter, in [ns]: each request clears them."""
+ASKED_AGAIN_NS: Final = 5_000_000_000  # between two requests for flags of a silent adapter: each request clears them
 BUS_ERRORS: Final = "the adapter reports errors on the bus, and no frame arrives: check bitrate, wiring and termination"
 _PORT_ERRORS: Final = (OSError, termios.error)  # pyserial lets termios.error through, which is no OSError
 
@@ -77,10 +73,9 @@ class PortReader:
         termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
 
     def read(self, timeout_s: float, wanted_bytes: int) -> Piece:
-        """Return the bytes received, once `wanted_bytes` have come, or no more; waits at most `timeout_s` for any.
+        """Return the bytes received, once `wanted_bytes` have come, or no more; wait at most `timeout_s` for any.
 
-        Raises:
-            OSError: the port is gone, and all earlier bytes have been returned.
+        Raises OSError once the port is gone, and all earlier bytes have been returned.
         """
         now_ns = self._clock_ns()
         end_ns = now_ns + round(timeout_s * 1e9)
@@ -125,32 +120,19 @@ class PortReader:
 class SlcanSerialLink(Link):
     """Link to a sensor on an slcan adapter.
 
-    Opening sends close, bitrate, time stamps on and open, and waits for no acknowledgement, since some
-    adapters never send one. What arrives before the line falls silent is older than the opening and dropped.
-    Closing sends close and time stamps off: some adapters keep that setting, and not every program expects stamps.
-    They keep it in an EEPROM, which wears, so a bus that stays silent is not asked for stamps at every opening.
-
-    It may be opened any number of times. An adapter with a USB serial number is then recognised under any
-    name of its port.
-
-    Attributes:
-        port: path of the serial port.
-        baudrate: speed of the serial line, in [bit/s]; USB-CDC adapters ignore it.
+    Opening waits for no acknowledgement, since some adapters never send one; what arrives before the line falls silent
+    is older than the opening and dropped. Closing switches time stamps off: some adapters keep that setting, and not
+    every program expects stamps. They keep it in an EEPROM, which wears, so a bus that stays silent is not asked for
+    stamps at every opening.
     """
 
-    def __init__(
-        self,
-        port: str,
-        baudrate: int = DEFAULT_BAUD,
-        *,
-        model: ModelMap = USPA44_MAP,
-    ) -> None:
+    def __init__(self, port: str, baudrate: int = DEFAULT_BAUD, *, model: ModelMap = USPA44_MAP) -> None:
         """Prepare a link; nothing is opened yet."""
         self.name = f"slcan:{port}"
         # No hardware sensor is a pseudo-terminal, so a device on one is emulated.
         self.kind: SourceKind = "emulated" if Path(port).resolve().is_relative_to("/dev/pts") else "device"
         self.port = port
-        self.baudrate = baudrate
+        self.baudrate = baudrate  # speed of the serial line, in [bit/s]; USB-CDC adapters ignore it
         self._triggers = model.triggers
         self._plugged = PluggedAdapter(port)
         # Two sensors at 100 scans a second take 832 kbit/s with stamps, and 704 without.
@@ -224,11 +206,7 @@ class SlcanSerialLink(Link):
         return scans
 
     def _ask_in_silence(self, port: serial.Serial, now_ns: int) -> None:
-        """Request the status flags where no scan comes, which they may explain: of any bus they hold an error at times.
-
-        They are not requested while scans come: some adapters obey one command a USB packet, and the answer arrives
-        among the frames.
-        """
+        """Request the status flags, which may explain that no scan comes: of any bus they hold an error at times."""
         decoder, asked_ns = self._scans.decoder, self._asked_ns
         if now_ns - self._scan_ns >= ADAPTER_ASKED_NS and (asked_ns is None or now_ns - asked_ns >= ASKED_AGAIN_NS):
             self._asked_ns = now_ns
@@ -258,7 +236,7 @@ class SlcanSerialLink(Link):
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""
-        return self._scans.can_ids
+        return self._scans.assembler.can_ids
 
     def serial_line(self) -> tuple[str, int]:
         """Return the port and its speed in [bit/s]."""

@@ -24,14 +24,7 @@ _ADDRESS: Final = re.compile(r"ws://(\[[0-9a-f:.]+\]|[^\s/:@?#\[\]]+)(?::([0-9]{
 
 
 class XelaServerLink(Link):
-    """Link to the vendor's xela_server, with all its sensors of the right geometry.
-
-    A server does not report its simulation mode: its scans then count as a device's.
-
-    Attributes:
-        url: URL of the server.
-        trouble: sensors that are left out or silent.
-    """
+    """Link to the vendor's xela_server; scans of its simulation mode, which it does not report, count as a device's."""
 
     def __init__(
         self,
@@ -43,7 +36,7 @@ class XelaServerLink(Link):
     ) -> None:
         """Prepare a link to ws://HOST[:PORT], for sensors of this geometry; raises SourceError for another URL.
 
-        `prefix` begins the names of its sensors; `mountings`, by these names, put taxels and the server's forces right.
+        `mountings`, by the names of sensors with `prefix`, put taxels and the server's forces right.
         """
         self._address = server_address(url)
         self.name = f"xela-server:{url}"
@@ -67,9 +60,8 @@ class XelaServerLink(Link):
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; waits at most `timeout_s` for the first message.
 
-        Raises:
-            LinkLostError: the server is gone. One that hangs is silent: its reader opens it again, which then fails.
-            DeviceError: it has no sensor that can be used.
+        Raises LinkLostError, and DeviceError where it has no sensor that can be used. A server that hangs is silent:
+        its reader opens it again, which then fails.
         """
         if self._connection is None:
             raise not_open()

@@ -7,8 +7,7 @@ unused. The unused bytes are not zero. The id of a taxel depends on the controll
     layout A (2018-2019)   id = 0x700 | board << 4 | taxel         speaks only after a trigger
     layout B (early 2020)  id = board << 8 | n, n = 0..31          two sensors a board; trigger
 
-A sensor's label does not show its map; with the wrong one, half of the taxels stay silent. The grids of pads are in
-`firmware_bridge.pad_geometry`.
+A sensor's label does not show its map; with the wrong one, half of the taxels stay silent.
 """
 
 from collections.abc import Mapping
@@ -48,12 +47,9 @@ class ModelMap:
 
 
 def layout_c(geometry: SensorGeometry) -> ModelMap:
-    """Return the id map of a current controller whose SDAs are the rows, their taxels numbered from right to left.
-
-    Ids can name eight SDAs with sixteen taxels each; it raises ValueError for more.
-    """
+    """Return the id map of a current controller whose SDAs are the rows, their taxels numbered from right to left."""
     rows, cols = geometry.rows, geometry.cols
-    if rows > 8 or cols > 16:
+    if rows > 8 or cols > 16:  # more than ids can name
         raise ValueError(f"{rows} x {cols} taxels, expected at most 8 x 16")
     taxels = {
         sda << 8 | taxel << 4 | controller: (str(controller), sda * cols + (cols - 1 - taxel))
@@ -65,10 +61,8 @@ def layout_c(geometry: SensorGeometry) -> ModelMap:
 
 
 USPA44_MAP: Final = layout_c(USPA44)
-USPA46_MAP: Final = layout_c(USPA46)
-"""Map of uSPa46: ids from the manual; columns from right to left, as inferred from uSPa44."""
-# Two SDAs of two rows each. That its columns run from right to left too is inferred from uSPa44, the same board; no
-# document confirms it.
+USPA46_MAP: Final = layout_c(USPA46)  # ids from the manual; columns from right to left, as inferred from uSPa44
+# Two SDAs of two rows each; columns as inferred from uSPa44, the same board.
 _XR1944: Final = {
     sda << 8 | taxel << 4 | controller: (str(controller), (sda * 2 + taxel // 4) * 4 + (3 - taxel % 4))
     for controller in CONTROLLERS

@@ -9,49 +9,32 @@ are dropped.
 
 from typing import Final, NamedTuple
 
-SLOWER: Final = 64
-"""Share of the time by which the smallest difference grows: a clock may be slow by as much. A delay of 0.1 s that lasts
-is forgotten in 7 s."""
+SLOWER: Final = 64  # share of the time by which the smallest difference grows: 0.1 s that last are forgotten in 7 s
+# Largest step back of the stamps before the clock counts as set or restarted: frames that change places in a driver's
+# queues step back by less than a millisecond. A wall clock set back by less, plus the pause, goes unnoticed.
 BACK_NS: Final = 4_000_000
-"""Largest step back of the stamps before the clock counts as set or restarted, in [ns].
-
-Frames that change places in a driver's queues step back by less than a millisecond. A wall clock set back between two
-frames by less than this plus the pause between them goes unnoticed: at 100 scans a second by 14 ms."""
-LONGEST_STEP_NS: Final = 20_000_000
-"""Time between two arrivals, in [ns], that counts at most: a read that was late is no evidence of a slow clock."""
+LONGEST_STEP_NS: Final = 20_000_000  # of the time between two arrivals counts at most: a late read makes no clock slow
+# In a row in which stamps advance twice as far as arrivals, or too slowly while reads were late: a backlog makes it so
+# once, and so does a machine that stood still.
 MOST_OFF: Final = 3
-"""Such times in a row in which stamps advance twice as far as arrivals, or too slowly while reads were late: a backlog
-makes it so once, and so does a machine that stood still."""
-SLOW_NS: Final = 10_000_000_000
-"""Time without a difference as small as the smallest, in [ns], after which the clock is slower than it may be."""
+SLOW_NS: Final = 10_000_000_000  # without a difference as small as the smallest, after which the clock is too slow
 
 
 class DeviceTime(NamedTuple):
-    """Time at which a frame was on the bus.
+    """Time at which a frame was on the bus."""
 
-    Attributes:
-        host_ns: time on the host's monotonic clock, in [ns], by the estimated offset at that moment.
-        own_ns: time on the device's clock, from any origin, in [ns]: pauses are measured by it, since the estimated
-            offset between the two clocks may change between two stamps.
-    """
-
-    host_ns: int
-    own_ns: int
+    host_ns: int  # on the host's monotonic clock, by the estimated offset at that moment
+    own_ns: int  # on the device's clock, from any origin: pauses are measured by it, since the offset may change
 
 
 class DeviceClock:
-    """Map from stamps of one device, which may wrap round, to the host's monotonic time.
-
-    Attributes:
-        begun_ns: monotonic time of the first arrival since the last restart, which set the offset, in [ns]; None before
-            it. That frame seems new even if it waited long to be read.
-        dropped: True once the stamps have shown that they are no clock.
-    """
+    """Map from stamps of one device, which may wrap round, to the host's monotonic time."""
 
     def __init__(self, tick_ns: int, wrap_ticks: int | None) -> None:
-        """Start without a stamp; ticks are of `tick_ns` [ns], and wrap at `wrap_ticks`, None if they never do."""
+        """Start without a stamp; ticks, of `tick_ns` [ns], wrap at `wrap_ticks`, None if they never do."""
+        # Arrival that set the offset, in [ns]; its frame seems new even if it waited long to be read.
         self.begun_ns: int | None = None
-        self.dropped = False
+        self.dropped = False  # True once the stamps have shown that they are no clock
         self._tick_ns = tick_ns
         self._wrap_ns = None if wrap_ticks is None else wrap_ticks * tick_ns
         self._stamp_ns = 0
@@ -72,10 +55,7 @@ class DeviceClock:
         return self._device_ns + self._smallest_ns
 
     def at(self, stamp: int, arrival_ns: int) -> DeviceTime | None:
-        """Return the time at which a frame was on the bus, never later than its arrival; None if stamps are no clock.
-
-        `stamp` is in ticks, and `arrival_ns` [ns] of monotonic time is never before that of the frame before.
-        """
+        """Return the time at which a frame was on the bus, never after its arrival; None if stamps are no clock."""
         if self.dropped:
             return None
         begun, since_ns = self.begun_ns is not None, arrival_ns - self._arrival_ns

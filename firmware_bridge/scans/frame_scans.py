@@ -10,36 +10,26 @@ from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 
 class FrameScans:
-    """Stages from frames to scans, over any number of openings.
-
-    Attributes:
-        clock: the adapter's clock.
-        errors: what the adapter reported of its bus.
-    """
+    """Stages from frames to scans, over any number of openings."""
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
-        self.clock = DeviceClock(1_000, None)
-        self.errors = BusErrors()
-        self._assembler = ScanAssembler(model)
-
-    @property
-    def can_ids(self) -> frozenset[int]:
-        """Standard CAN ids received so far, of any device."""
-        return self._assembler.can_ids
+        self.clock = DeviceClock(1_000, None)  # the adapter's clock
+        self.errors = BusErrors()  # what the adapter reported of its bus
+        self.assembler = ScanAssembler(model)
 
     def begin_anew(self) -> None:
         """Discard open scans, since the link was broken."""
-        self._assembler.begin_anew()
+        self.assembler.begin_anew()
 
     def feed_frame(self, frame: CanFrame, stamp_us: int | None, time_ns: int) -> list[Scan]:
         """Return the scans that a frame closes; it arrived at `time_ns` [ns], by its stamp, if any, at `stamp_us`."""
         self.errors.frame_heard()
         device = None if stamp_us is None else self.clock.at(stamp_us, time_ns)
-        return self._assembler.feed_frame(frame, time_ns, device)
+        return self.assembler.feed_frame(frame, time_ns, device)
 
     def counters(self) -> dict[str, int]:
         """Return the counters of all stages."""
-        return self.errors.counters() | self._assembler.counters()
+        return self.errors.counters() | self.assembler.counters()
 
 
 class GsUsbScans(FrameScans):

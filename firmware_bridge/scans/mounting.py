@@ -8,7 +8,7 @@ never zeroed: their axes are turned at once.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,23 +22,11 @@ AS_MAPPED: Final = tuple(range(USPA44.taxel_count))  # default order of the defa
 
 @dataclass(frozen=True)
 class Mounting:
-    """Mounting of one sensor; by default that of its id map.
+    """Mounting of one sensor; by default that of its id map. Invalid values raise a ValueError."""
 
-    An order that is left out or empty is that of the id map.
-
-    Attributes:
-        order: for each place on the pad, row-major from the top left, the taxel of the id map that lies there.
-        swap_xy: True where the wire's x is the pad's y, and the other way round.
-        signs: 1 or -1 for x (to the right), y (down) and z (into the pad), after the swap.
-        taxel_count: number of taxels of the sensor.
-
-    Raises:
-        ValueError: one of these is invalid.
-    """
-
-    order: tuple[int, ...] = ()
-    swap_xy: bool = False
-    signs: tuple[int, int, int] = (1, 1, 1)
+    order: tuple[int, ...] = ()  # for each place, row-major from the top left, the id map's taxel there
+    swap_xy: bool = False  # True where the wire's x is the pad's y, and the other way round
+    signs: tuple[int, int, int] = (1, 1, 1)  # 1 or -1 for x (to the right), y (down), z (into the pad), after the swap
     taxel_count: int = USPA44.taxel_count
 
     def __post_init__(self) -> None:
@@ -65,19 +53,13 @@ class Mounting:
         turned *= np.asarray(self.signs, dtype=np.float32)[:, None, None]
         return turned
 
-    def place_counts(self, counts: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Reorder counts (..., 3, rows, cols) from the order of the id map to the places on the pad."""
-        return counts.reshape(*counts.shape[:-2], -1)[..., list(self.order)].reshape(counts.shape)
+    def place_counts(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values of all taxels, (..., rows, cols), from the order of the id map at the places on the pad."""
+        return values.reshape(*values.shape[:-2], -1)[..., list(self.order)].reshape(values.shape)
 
     def place(self, scan: Scan) -> Scan:
-        """Reorder a scan from the order of the id map to the places on the pad, the vendor's readings included.
-
-        Counts stay along the wire's axes; the vendor's newtons are turned to the pad's, still by its own calibration.
-        """
-        shape = scan.fresh.shape
-        order = list(self.order)
-        counts = self.place_counts(scan.counts)
-        fresh, renewed = (array.ravel()[order].reshape(shape) for array in (scan.fresh, scan.renewed))
+        """Reorder a scan from the order of the id map to the places on the pad, and turn the vendor's newtons."""
+        counts, fresh, renewed = map(self.place_counts, (scan.counts, scan.fresh, scan.renewed))
         for array in (counts, fresh, renewed):
             array.setflags(write=False)
         vendor = None if scan.vendor is None else self._place_vendor(scan.vendor)
@@ -96,24 +78,15 @@ class Mounting:
         )
 
     def _place_vendor(self, vendor: VendorReading) -> VendorReading:
-        order = list(self.order)
-        newtons = vendor.newtons
-        if newtons is not None:
-            along = newtons.reshape(len(AXES), -1)[[1, 0, 2] if self.swap_xy else [0, 1, 2]][:, order]
-            along *= np.asarray(self.signs, dtype=np.float32)[:, None]
-            newtons = along.reshape(newtons.shape)
-        temperature_k, ups_hz = (
-            None if array is None else array.ravel()[order].reshape(array.shape)
-            for array in (vendor.temperature_k, vendor.ups_hz)
+        newtons, temperature_k, ups_hz = (
+            None if array is None else self.place_counts(array)
+            for array in (vendor.newtons, vendor.temperature_k, vendor.ups_hz)
         )
-        return VendorReading(newtons, temperature_k, ups_hz)
+        return VendorReading(None if newtons is None else self.correct(newtons), temperature_k, ups_hz)
 
 
 def placed_map(model: ModelMap, mountings: Mapping[str, Mounting], prefix: str = "") -> ModelMap:
-    """Return the map of sensors as they are wired with taxels at their places on the pad; it sorts every scan anyway.
-
-    Names of sensors begin with `prefix`, and `mountings` are by these; a sensor without one keeps the order of the map.
-    """
+    """Return an id map with taxels at their places on the pad; `mountings` are by names of sensors with `prefix`."""
     place_of = {
         sensor: {taxel: place for place, taxel in enumerate(mounting.order)}
         for sensor, mounting in mountings.items()

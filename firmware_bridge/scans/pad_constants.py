@@ -1,7 +1,6 @@
 """Properties of the pad on a sensor: its material, its thickness, the gains of its taxels.
 
-A network may take them as input, since the same reading means another press on a thicker or harder pad. They turn no
-axis and correct no recording: the mounting does.
+A network may take them as input, since the same reading means another press on a thicker or harder pad.
 """
 
 import math
@@ -30,46 +29,28 @@ PAD_RANGES: Final = MappingProxyType(
 """Constants of a pad, in this order, and their ranges: wider than for any pad, so that only slips are refused."""
 GAIN_RANGE: Final = (0.01, 100.0)
 GAINS: Final = len(AXES) * USPA44.taxel_count  # number of gains of the default pad
-GAIN_SPREAD: Final = 0.075
-"""Standard deviation of a chip's gain on one axis about 1, over new sensors: +-15 % are seen on devices."""
+GAIN_SPREAD: Final = 0.075  # standard deviation of a chip's gain on one axis over new sensors: +-15 % are seen
 LEVEL_90: Final = 1.645  # half width of a normal 90 % interval, in standard deviations
-UNMEASURED_CERTAINTY: Final = 0.9
-"""Certainty of gains without intervals: entered by a person, who has measured them somehow."""
+UNMEASURED_CERTAINTY: Final = 0.9  # of gains without intervals: a person has measured them somehow
 
 
 @dataclass(frozen=True)
 class Pad:
-    """Constants of one sensor's pad, each None where it is not available.
+    """Constants of one sensor's pad, each None where it is not available; invalid ones raise a ValueError."""
 
-    Attributes:
-        thickness_mm: thickness of the soft layer, in [mm].
-        shear_modulus_mpa: shear modulus of its material, in [MPa].
-        poisson: Poisson's ratio.
-        in_plane_share: factor on the in-plane movement of the magnets.
-        magnet_height_mm: height of the magnets' centres over the chips, in [mm].
-        counts_per_newton: summed z per [N].
-        pitch_mm: true distance of the taxels of a uSPa44, in [mm].
-        free_sides: compliance of the pad's sides, 0 where they are held, 1 where nothing holds them.
-        intervals: lowest and highest value of a constant by its measurement; nothing is computed from them.
-        gains: relative gain of each place on each axis, 1 where it reads as the others: x of all places row by row,
-            then y, then z, along the pad's axes. Networks that use gains get readings divided by them.
-        gain_half_widths: half widths of the gains' 90 % intervals, each over its gain, in the same order.
-
-    Raises:
-        ValueError: one of these is invalid.
-    """
-
-    thickness_mm: float | None = None
-    shear_modulus_mpa: float | None = None
+    thickness_mm: float | None = None  # thickness of the soft layer, in [mm]
+    shear_modulus_mpa: float | None = None  # shear modulus of its material, in [MPa]
     poisson: float | None = None
-    in_plane_share: float | None = None
-    magnet_height_mm: float | None = None
-    counts_per_newton: float | None = None
-    pitch_mm: float | None = None
-    free_sides: float | None = None
-    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    in_plane_share: float | None = None  # factor on the in-plane movement of the magnets
+    magnet_height_mm: float | None = None  # height of the magnets' centres over the chips, in [mm]
+    counts_per_newton: float | None = None  # summed z per [N]
+    pitch_mm: float | None = None  # true distance of the taxels of a uSPa44, in [mm]
+    free_sides: float | None = None  # compliance of the pad's sides, 0 where they are held, 1 where nothing holds them
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # of constants, by their measurement
+    # Relative gain of each place on each axis, 1 where it reads as the others: x of all places row by row, then y, then
+    # z, along the pad's axes. Networks that use gains get readings divided by them.
     gains: tuple[float, ...] | None = None
-    gain_half_widths: tuple[float, ...] | None = None
+    gain_half_widths: tuple[float, ...] | None = None  # half of the gains' 90 % intervals, each over its gain
 
     def __post_init__(self) -> None:
         for name, value in self.constants.items():

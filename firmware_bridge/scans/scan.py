@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import SensorGeometry
 
+SCANS_COUNTED: Final = ("scans", "torn_wire", "torn_source", "repeated", "missing_taxels")
 ABSENT: Final = -1  # marker of a taxel without a reading in this scan; raw counts are unsigned, so no reading is -1
 LONGEST_SENSOR_NAME: Final = 64
 
@@ -19,59 +20,37 @@ def is_sensor_name(name: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class VendorReading:
-    """Values that the vendor's software reports in addition to the counts; None where it does not.
+    """Values that the vendor's software reports in addition to the counts; None where it does not."""
 
-    Attributes:
-        newtons: (3, rows, cols) float32, axes x, y, z, in [N].
-        temperature_k: (rows, cols) float32, in [K]; NaN where a taxel has no thermometer.
-        ups_hz: (rows, cols) float32, rate at which each taxel is renewed, in [Hz].
-    """
-
-    newtons: NDArray[np.float32] | None = None
-    temperature_k: NDArray[np.float32] | None = None
-    ups_hz: NDArray[np.float32] | None = None
+    newtons: NDArray[np.float32] | None = None  # (3, rows, cols), axes x, y, z, in [N]
+    temperature_k: NDArray[np.float32] | None = None  # (rows, cols), in [K]; NaN where a taxel has no thermometer
+    ups_hz: NDArray[np.float32] | None = None  # (rows, cols), rate at which each taxel is renewed, in [Hz]
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """One reading of all taxels of one sensor.
+    """One reading of all taxels of one sensor."""
 
-    Attributes:
-        sensor: name of the sensor on its link, such as the controller id "4".
-        number: index of the scan, from 0 for each sensor.
-        time_ns: monotonic time at which its newest reading arrived, in [ns].
-        counts: (3, rows, cols) int32 raw counts, axes x, y, z; ABSENT where not fresh.
-        fresh: (rows, cols) bool, True where the taxel's reading arrived in this scan.
-        renewed: (rows, cols) bool, True where it is fresh and differs from the taxel's reading before. Noise
-            renews a live taxel almost surely, so a fresh taxel that is not renewed is most
-            likely an old reading sent again.
-        device_ns: time at which its newest reading was on the bus or in the sensor, by the device's time stamps mapped
-            to monotonic time, in [ns]; None without time stamps. The difference to `time_ns` is delay.
-        vendor: values of the vendor's software at the same moment; None for a link that reads the sensor itself.
-        unread_ns: longest time that it may have waited to be read, in [ns], since the link was not read meanwhile;
-            0 if the link was read.
-        complete: True if every taxel's reading arrived.
-        whole: True if every taxel's reading arrived and is new: nothing is torn or repeated.
-        on_bus_ns: `device_ns`, or without one `time_ns`.
-        not_before_ns: estimated monotonic time before which no reading of it was taken, in [ns]. It follows from the
-            device's time stamps, and from the last time at which the link was empty: the first reading after an
-            opening sets the device's clock, and seems new even if it waited long to be read.
-        vendor_force_n: force x, y, z on the pad in [N], by the vendor; None if it is missing, or includes old readings.
-    """
-
-    sensor: str
-    number: int
-    time_ns: int
-    counts: NDArray[np.int32]
-    fresh: NDArray[np.bool_]
+    sensor: str  # name of the sensor on its link, such as the controller id "4"
+    number: int  # index of the scan, from 0 for each sensor
+    time_ns: int  # monotonic time at which its newest reading arrived, in [ns]
+    counts: NDArray[np.int32]  # (3, rows, cols) int32 raw counts, axes x, y, z; ABSENT where not fresh
+    fresh: NDArray[np.bool_]  # (rows, cols), True where the taxel's reading arrived in this scan
+    # (rows, cols), True where it is fresh and differs from the taxel's reading before. Noise renews a live taxel almost
+    # surely, so a fresh taxel that is not renewed is most likely an old reading sent again.
     renewed: NDArray[np.bool_]
+    # Time at which its newest reading was on the bus or in the sensor, by the device's time stamps mapped to monotonic
+    # time, in [ns]; the difference to `time_ns` is delay.
     device_ns: int | None = None
-    vendor: VendorReading | None = None
-    unread_ns: int = 0
+    vendor: VendorReading | None = None  # None for a link that reads the sensor itself
+    unread_ns: int = 0  # longest time that it may have waited, in [ns], since the link was not read meanwhile
     complete: bool = field(init=False, repr=False, compare=False)
     whole: bool = field(init=False, repr=False, compare=False)
     on_bus_ns: int = field(init=False, repr=False, compare=False)
+    # Estimated monotonic time before which no reading of it was taken, in [ns]: by the device's time stamps, and by the
+    # last time at which the link was empty: the first reading after an opening sets the device's clock, and seems new.
     not_before_ns: int = field(init=False, repr=False, compare=False)
+    # Force x, y, z on the pad in [N], by the vendor; None if it is missing, or includes old readings.
     vendor_force_n: tuple[float, float, float] | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -102,6 +81,16 @@ class Scan:
         return self.complete and True not in self.renewed.tobytes()
 
 
+def count_scan(counts: dict[str, int], scan: Scan) -> None:
+    """Count a scan in those of SCANS_COUNTED."""
+    counts["scans"] += 1
+    if not scan.whole:
+        counts["missing_taxels"] += int(np.count_nonzero(~scan.fresh))
+        counts["torn_wire"] += not scan.complete
+        counts["torn_source"] += scan.complete and scan.torn
+        counts["repeated"] += scan.repeated
+
+
 class ScanSeries:
     """Sequence of the scans of one sensor: numbers them and separates new readings from old ones."""
 
@@ -122,8 +111,7 @@ class ScanSeries:
     ) -> Scan:
         """Return the next scan, of counts (3, rows, cols), ABSENT where no reading came, which become read-only.
 
-        `time_ns`, `device_ns` and `vendor` are as in Scan. `whole` is True if it certainly holds every taxel, which
-        halves the cost.
+        `whole` is True if it certainly holds every taxel, which halves the cost.
         """
         if whole:
             fresh, renewed = self._all_fresh, np.logical_or.reduce(counts != self._last)

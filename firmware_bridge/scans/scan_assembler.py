@@ -1,16 +1,16 @@
 """Assembly of the frames on a wire to scans. No I/O, no clock.
 
-The wire has no end-of-scan marker. A scan closes when every taxel has come, or the last one of the sensor's cycle, or
-when the next reading belongs to another cycle: after a pause, or where the order of the taxels has wrapped round
-(`wire_cycle`). Then it is torn. Readings of no certain cycle are left out and counted (`resynchronised`): the rest of
-the cycle into which the link was opened, and fragments of fewer than half of the taxels that no pause separates.
+A scan closes when every taxel has come, or the last one of the sensor's cycle, or when the next reading belongs to
+another cycle: after a pause, or where the order of the taxels has wrapped round (`wire_cycle`). Then it is torn.
+Readings of no certain cycle are left out and counted (`resynchronised`): the rest of the cycle into which the link was
+opened, and fragments of fewer than half of the taxels that no pause separates.
 
 Without time stamps a whole cycle that ends late waits for the next ones to show whether a cycle was lost: with sixteen
 frames lost between them, its halves may be of two. Then it is left out, too. Limit: nothing closes while no reading
 comes, so half a scan at the end of a stream is never returned.
 
 Frames that were read together are taken together: those of a sensor that go on in its order, without a pause, join its
-open scan at once. So a scan costs little, also where the frames of several sensors mix, and a read ends within it.
+open scan at once, also where the frames of several sensors mix.
 """
 
 import struct
@@ -27,24 +27,14 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.device_clock import DeviceTime
-from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
+from firmware_bridge.scans.scan import ABSENT, SCANS_COUNTED, Scan, ScanSeries, count_scan
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, WireCycle
 
-READING_BYTES: Final = 8
-"""Bytes of the data of a reading: one unused, X, Y, Z as unsigned big-endian 16 bit, one unused. The unused ones are
-not zero."""
+READING_BYTES: Final = 8  # bytes of the data of a reading, of which the first and the last are unused
 
-_COUNTED: Final[tuple[str, ...]] = (
-    "scans",
-    "torn_wire",
-    "torn_source",
-    "repeated",
-    "missing_taxels",
-    "duplicates",
-    "unconfirmed",
-    "abandoned",
-    "resynchronised",
-)
+# Besides scans: the same frame twice in a row; readings of sensors that do not exist (yet), of scans that a broken link
+# left open, and of cycles whose beginning or end was uncertain.
+_COUNTED: Final = (*SCANS_COUNTED, "duplicates", "unconfirmed", "abandoned", "resynchronised")
 _unpack_counts = struct.Struct(">xHHHx").unpack
 
 
@@ -71,15 +61,10 @@ class ScanAssembler:
 
     A sensor exists from its first whole scan on, or from its second in a row with half of the taxels or more: bits that
     flip in ids must not create a sensor. (Half, because the wrong id map shows half of the taxels.)
-
-    Memory: one open scan per sensor name; a ModelMap has at most 16 names.
-
-    Attributes:
-        foreign: number of frames that are of no taxel of this model.
     """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
-        self.foreign = 0
+        self.foreign = 0  # number of frames that are of no taxel of this model
         self._model = model
         self._places = {key(can_id): place for can_id, place in model.taxels.items()}
         self._keys = set[int]()  # bounded: there are at most 2048 of standard ids
@@ -110,8 +95,7 @@ class ScanAssembler:
     ) -> list[Scan]:
         """Return the scans that readings close, which arrived together at `time_ns` in [ns], in their order on the bus.
 
-        With time stamps `own_ns` are the times at which they were on the bus by the device's own clock, and `offset_ns`
-        is that from it to the host's, in [ns].
+        `own_ns` are their time stamps by the device's clock, and `offset_ns` is that from it to the host's, in [ns].
         """
         runs, keys = self._runs(readings.keys), len(readings.keys)
         self._speaking = [self._sensor(name) for name in runs]
@@ -156,10 +140,7 @@ class ScanAssembler:
             sensor.begin_anew()
 
     def fewest_missing(self) -> int:
-        """Return the number of readings that must come at least before a sensor that sends can close a whole scan.
-
-        One that a flipped bit created is left out.
-        """
+        """Return the number of readings that must come at least before a sensor that sends can close a whole scan."""
         counts = [sensor.missing for sensor in self._speaking if sensor.confirmed]
         if counts:
             return min(counts)
@@ -168,17 +149,8 @@ class ScanAssembler:
         return self._model.geometry.taxel_count if learnt else 1
 
     def counters(self) -> dict[str, int]:
-        """Return the counters, summed over all sensors.
-
-        foreign: frames of no taxel; readings; duplicates: the same frame twice in a row; unconfirmed: readings of
-        sensors that do not exist (yet); abandoned: of scans that a broken link left open; resynchronised: left out,
-        since the beginning or end of their cycle was uncertain; scans; torn_wire: taxels missing; torn_source:
-        complete, but only partly renewed; repeated: nothing renewed; missing_taxels.
-        """
-        totals: dict[str, int] = dict.fromkeys(_COUNTED, 0)
-        for sensor in self._sensors.values():
-            for name, count in sensor.counts.items():
-                totals[name] += count
+        """Return the counters, summed over all sensors."""
+        totals = {name: sum(sensor.counts[name] for sensor in self._sensors.values()) for name in _COUNTED}
         return {"foreign": self.foreign, "readings": self._readings} | totals
 
 
@@ -328,7 +300,10 @@ class _Sensor:
         if not (shows_pauses or on_pace):  # as many frames may be lost as make the parts of two cycles fit
             self.counts["resynchronised"] += count * sum(missing == 0 for *_, missing in held)
             held = [closed for closed in held if closed[-1]]
-        return [self._count(self._series.close(*closed, whole=missing == 0), missing) for *closed, missing in held]
+        scans = [self._series.close(*closed[:3], whole=closed[3] == 0) for closed in held]
+        for scan in scans:
+            count_scan(self.counts, scan)
+        return scans
 
     def _counts_of(self, taxels: Sequence[int], columns: Sequence[Sequence[int]]) -> NDArray[np.int32]:
         """Return counts (3, rows, cols) of readings in their order of arrival, ABSENT where no reading came."""
@@ -337,12 +312,3 @@ class _Sensor:
         for taxel, x, y, z in zip(taxels, *columns, strict=True):
             placed[taxel], placed[taxel + count], placed[taxel + 2 * count] = x, y, z
         return np.array(placed, dtype=np.int32).reshape(self._scan_shape)  # for so few numbers the fastest way
-
-    def _count(self, scan: Scan, missing: int) -> Scan:
-        self.counts["scans"] += 1
-        if not scan.whole:
-            self.counts["missing_taxels"] += missing
-            self.counts["torn_wire"] += missing > 0
-            self.counts["repeated"] += scan.repeated
-            self.counts["torn_source"] += missing == 0 and scan.torn
-        return scan

@@ -1,18 +1,16 @@
 """Cycle of a sensor on the wire, as the stream shows it: the order of its taxels, and the longest pause within it.
 
 Nothing marks the beginning of a cycle. Two things show it: the bus pauses between cycles, and the order of the taxels,
-which is the same each time, wraps round. By default the order is that of the ids. A sensor with another order gives
-fragments; then its cycles are cut by pauses alone, until two in a row came in the same order, which is then the
-sensor's.
+by default that of the ids, wraps round. A sensor with another order gives fragments; then its cycles are cut by pauses
+alone, until two in a row came in the same order, which is then the sensor's.
 
 A pause within a cycle ends it where whole cycles may have been lost meanwhile, so from half a period on, of the shorter
 ones, as a lost cycle makes them longer. Until there are enough, the shortest time between two readings of one taxel is
-the period; while the order is to be learnt, an eighth of it is a pause. Limit: where nearly all cycles of the first
-eight are lost, two may mix.
+the period. Limit: where nearly all cycles of the first eight are lost, two may mix.
 
 Arrivals show no pause within what was read in one piece. There a lost cycle shows by the count: cycles end a period
-apart, and a read only delays them. So one that ends late by most of a period may hold readings of two cycles, unless
-a later one ends in time; where all that follow are as late, some were lost.
+apart, and a read only delays them. So one that ends late by most of a period may be of two cycles, unless a later one
+ends in time; where all that follow are as late, some were lost.
 """
 
 from collections import deque
@@ -23,40 +21,30 @@ LONGEST_PAUSE_NS: Final = 60_000_000
 """Longest pause between two readings of one scan, whatever the period, in [ns]: the slowest sensor on record has 17 ms
 there, and an FTDI chip holds bytes back for 16. After a longer one, as when the bus was off, a reading may belong to
 another press."""
-SHORTEST_PAUSE_NS: Final = 1_500_000
-"""Shortest time that counts as a pause, in [ns]: stamps and adapters with steps of 1 ms show less without one."""
+SHORTEST_PAUSE_NS: Final = 1_500_000  # that counts as one: stamps and adapters with steps of 1 ms show less without one
 MOST_INTERVALS: Final = 128  # intervals between cycles that give the period
 LEAST_INTERVALS: Final = 8  # intervals from which it shows lost cycles, and pauses are judged by the shorter ones
-MOST_DOUBTS: Final = 8
-"""Signs of another order in a row, without a whole cycle between them, after which the order is dropped."""
+MOST_DOUBTS: Final = 8  # signs of another order in a row after which the order is dropped
 
 
 class WireCycle:
-    """Learnt properties of one sensor's cycle.
-
-    Attributes:
-        order: taxels in their order of arrival; empty while it is not learnt.
-        places: place of each taxel in a cycle; NOWHERE for all while the order is not learnt.
-        pause_ns: longest pause between two readings of one cycle, in [ns].
-        doubts: signs of another order in a row; a whole cycle resets them.
-        gaps_ns: gaps between the newest readings, of one cycle at most, in [ns]; None where they are not needed.
-        period_ns: time from cycle to cycle, in [ns], by the clock of the pauses; None until it is measured.
-        in_pieces: True if several cycles seem to end at once by that clock, so that it does not show the pauses.
-    """
+    """Learnt properties of one sensor's cycle."""
 
     NOWHERE: Final = -9
 
     def __init__(self, order: Sequence[int]) -> None:
         """Start with this order, which holds until the stream shows another."""
-        self.pause_ns = LONGEST_PAUSE_NS
+        self.pause_ns = LONGEST_PAUSE_NS  # longest pause between two readings of one cycle
+        # True if several cycles seem to end at once by that clock, so that it does not show the pauses.
         self.in_pieces = False
         self._length = len(order)
+        # Gaps between the newest readings, of one cycle at most, in [ns]; None where they are not needed.
         self.gaps_ns: deque[int] | None = deque(maxlen=self._length)
         self._cycle_ns, self._read_ns = self._length * LONGEST_PAUSE_NS, 0
         self._read_at_ns: dict[int, int] = {}
-        self.doubts = 0
+        self.doubts = 0  # signs of another order in a row
         self._newest_order: tuple[int, ...] = ()
-        self.period_ns: int | None = None
+        self.period_ns: int | None = None  # time from cycle to cycle, by the clock of the pauses
         self._intervals: deque[int] = deque(maxlen=MOST_INTERVALS)
         self._until_renewed = self._paused_at = 0
         self._ended_ns: int | None = None
@@ -72,8 +60,8 @@ class WireCycle:
     def goes_on(self, newest: int, place: int, *, came: bool, paused: bool, paced: bool) -> bool:
         """Return True if a reading at a place belongs to the open cycle, whose furthest place so far is `newest`.
 
-        `came`: the cycle has a reading of this taxel already. `paused`: a pause came before the reading. `paced`: it
-        may be a late read, and `count` will show it where cycles were lost.
+        `came`: the cycle has this taxel already. `paused`: a pause came before. `paced`: that may be a late read, and
+        `count` will show it where cycles were lost.
         """
         if not self.order:
             return not (paused or came)
@@ -118,10 +106,6 @@ class WireCycle:
             if before == self._newest_order:
                 self._learn(before)
 
-    def late(self, time_ns: int) -> bool:
-        """Return True if a cycle that ends at `time_ns` [ns] may hold readings of two, by the pace of those before."""
-        return self.has_pace and self._ended_ns is not None and time_ns - self._due_ns > self._later_ns
-
     @property
     def has_pace(self) -> bool:
         """True once the period is known so well that it shows lost cycles."""
@@ -133,8 +117,8 @@ class WireCycle:
         Return True if no cycle was lost up to it, by the pace of those before; None if that does not show yet, and
         False once all come as late. One whose end was lost, not `ended`, shows nothing: it seems early.
         """
-        late = self.late(time_ns)
         ended_ns, self._ended_ns = self._ended_ns, time_ns
+        late = self.has_pace and ended_ns is not None and time_ns - self._due_ns > self._later_ns
         if ended_ns is None or not self.has_pace:
             self._due_ns = time_ns
         if ended_ns is not None:
@@ -188,7 +172,8 @@ class WireCycle:
             self._until_renewed = 32 if count == MOST_INTERVALS else 1
 
     def _learn(self, order: tuple[int, ...]) -> None:
-        self.order = order
+        self.order = order  # taxels in their order of arrival; empty while it is not learnt
+        # Place of each taxel in a cycle; NOWHERE for all while the order is not learnt.
         self.places = {taxel: place for place, taxel in enumerate(order)} if order else _Nowhere()
         self.doubts = 0
         if not order:

@@ -32,35 +32,23 @@ HIGHEST_UPS_HZ: Final = 10_000.0
 HIGHEST_NEWTONS: Final = 1000.0
 KELVIN: Final = (200.0, 500.0)
 WELCOME: Final = "Welcome"
-_COUNTED: Final = [
-    "messages",
-    "welcomes",
-    "without_readings",
-    "bad_json",
-    "bad_sensor",
-    "foreign_sensor",
-    "bad_values",
-]
+# Messages without a valid sequence number are "bad_json"; sensors without valid counts "bad_sensor", those of another
+# geometry "foreign_sensor"; forces, temperatures, rates and times that are left out "bad_values".
+_COUNTED: Final = (
+    *("messages", "welcomes", "without_readings", "bad_json"),
+    *("bad_sensor", "foreign_sensor", "bad_values"),
+)
 
 
 class ServerReading(NamedTuple):
-    """Last reading of one sensor in the server.
+    """Last reading of one sensor in the server."""
 
-    Attributes:
-        sensor: number of the sensor in the server, such as "1".
-        counts: (3, taxels) int32, axes x, y, z.
-        ups_hz: rate at which each taxel is renewed, in [Hz]; None if not reported.
-        newtons: (3, rows, cols) float32, by the vendor's calibration, in [N]; None if not reported.
-        temperature_k: (rows, cols) float32, in [K], NaN where not reported; None if not reported for any taxel.
-        acquired_s: time at which it was read from the sensor, in [s] of the server's clock; None if not reported.
-    """
-
-    sensor: str
-    counts: NDArray[np.int32]
-    ups_hz: Sequence[float] | None
-    newtons: NDArray[np.float32] | None
-    temperature_k: NDArray[np.float32] | None
-    acquired_s: float | None
+    sensor: str  # number of the sensor in the server, such as "1"
+    counts: NDArray[np.int32]  # (3, taxels) int32, axes x, y, z
+    ups_hz: Sequence[float] | None  # rate at which each taxel is renewed, in [Hz]
+    newtons: NDArray[np.float32] | None  # (3, rows, cols), by the vendor's calibration, in [N]
+    temperature_k: NDArray[np.float32] | None  # (rows, cols), in [K], NaN where not reported
+    acquired_s: float | None  # time at which it was read from the sensor, in [s] of the server's clock
 
 
 class ServerMessage(NamedTuple):
@@ -72,14 +60,10 @@ class ServerMessage(NamedTuple):
 
 
 class ServerDecoder:
-    """Decoder of single messages, of any version of the server.
-
-    Attributes:
-        foreign: descriptions by the server of sensors that are not of this geometry, by name.
-    """
+    """Decoder of single messages, of any version of the server."""
 
     def __init__(self, geometry: SensorGeometry = USPA44) -> None:
-        self.foreign: dict[str, str] = {}
+        self.foreign: dict[str, str] = {}  # what the server calls sensors of another geometry, by name
         self._geometry = geometry
         self._counted: dict[str, int] = dict.fromkeys(_COUNTED, 0)
 
@@ -106,12 +90,7 @@ class ServerDecoder:
         return ServerMessage(sequence, self._time_s(content.get("time")), usable)
 
     def counters(self) -> dict[str, int]:
-        """Return the counts of messages and of their errors.
-
-        messages; welcomes; without_readings: no sensor named; bad_json: no JSON, or no valid sequence number. For
-        sensors: bad_sensor: no valid counts; foreign_sensor: of another geometry; bad_values: forces, temperatures,
-        rates or times that are left out.
-        """
+        """Return the counts of messages and of their errors."""
         return dict(self._counted)
 
     def _reading(self, name: str, content: dict[str, Any]) -> ServerReading | None:

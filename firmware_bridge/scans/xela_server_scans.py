@@ -1,18 +1,16 @@
 """Stage from readings of the vendor's server to scans. No I/O, no clock.
 
 The server sends its readings at its own pace, old ones again, and the reading of a taxel with older ones of its
-neighbours: 507 messages a second were observed for a sensor that renewed seven taxels meanwhile. So its pace has no
-meaning. A taxel has been renewed if its counts have changed, or if it is due by `ups`: then it has the same counts
-again. A scan closes once every taxel has been renewed that is renewed about as often as most; then it holds the newest
-reading of each.
+neighbours: 507 messages a second were observed for a sensor that renewed seven taxels meanwhile. A taxel has been
+renewed if its counts have changed, or if it is due by `ups`: then it has the same counts again. A scan closes once
+every taxel has been renewed that is renewed about as often as most; then it holds the newest reading of each.
 
-- A still pad gives scans at the rate of `ups`, repeated ones if it has no noise. A loose cable gives no scan, as on the
-  wire, however long the server repeats the last reading: a taxel is absent while its `ups` is 0, and all are while the
-  sensor's time stands still; a sensor without a reading for so long is in trouble. Where the server reports either for
-  all taxels and their counts go on changing, its report is wrong, and the usual `ups` replaces the zeros.
+- A still pad gives scans at the rate of `ups`, repeated ones if it has no noise. A loose cable gives no scan, however
+  long the server repeats the last reading: a taxel is absent while its `ups` is 0, and all are while the sensor's time
+  stands still. Where all would be absent and their counts go on changing, the usual `ups` replaces the zeros.
 - A message that renews most taxels belongs to one cycle, and the others in it count as repeated: noise does that now
   and then, and waiting for them would cost a cycle.
-- Within a cycle nothing shows which readings belong together; slow servers mix those of two cycles, as on the wire.
+- Within a cycle nothing shows which readings belong together; slow servers mix those of two cycles.
 """
 
 from collections.abc import Mapping
@@ -25,13 +23,12 @@ from numpy.typing import NDArray
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.device_clock import DeviceClock
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries, VendorReading
+from firmware_bridge.scans.scan import ABSENT, SCANS_COUNTED, Scan, ScanSeries, VendorReading, count_scan
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
 from firmware_bridge.schedule import NS_PER_S, SERVER_READING_OLD_NS
 
 MOST_MISSED: Final = 100_000
 _COUNTED: Final = ["repeated_messages", "missed_messages", "server_restarts"]
-_COUNTED_BY_SENSOR: Final = ["scans", "torn_wire", "torn_source", "repeated", "missing_taxels"]
 
 
 class ServerScans:
@@ -96,15 +93,8 @@ class ServerScans:
         return scans
 
     def counters(self) -> dict[str, int]:
-        """Return the counters of the decoder and of the scans.
-
-        repeated_messages were dropped; missed_messages: numbers that never came; server_restarts: the count restarted;
-        and as for every link scans, torn_wire, torn_source, repeated and missing_taxels.
-        """
-        totals: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
-        for sensor in self._sensors.values():
-            for name, count in sensor.counted.items():
-                totals[name] += count
+        """Return the counters of the decoder and of the scans."""
+        totals = {name: sum(sensor.counted[name] for sensor in self._sensors.values()) for name in SCANS_COUNTED}
         return self._decoder.counters() | self._counted | totals
 
     def _in_order(self, sequence: int) -> bool:
@@ -127,7 +117,7 @@ class _ServerSensor:
 
     def __init__(self, name: str, geometry: SensorGeometry, mounting: Mounting | None) -> None:
         self._mounting = mounting if mounting and (mounting.moves_taxels or mounting.turns_axes) else None
-        self.counted: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
+        self.counted: dict[str, int] = dict.fromkeys(SCANS_COUNTED, 0)
         self._geometry = geometry
         self._series = ScanSeries(name, geometry)
         # By the vendor's data sheet, for a server that does not report it.
@@ -178,10 +168,7 @@ class _ServerSensor:
         return self._close(np.where(self._come, reading.counts, ABSENT), arrival_ns, device_ns, self._vendor(reading))
 
     def _rates_hz(self, reading: ServerReading, arrival_ns: int, *, old: bool) -> NDArray[np.float64]:
-        """Return the rate of each taxel, in [Hz]; 0 for all that the server reports dead, unless their counts change.
-
-        A server without the rates reports 0 as well.
-        """
+        """Return the rate of each taxel, in [Hz]; 0 for those reported dead, unless their counts change."""
         measured = reading.ups_hz is not None and any(reading.ups_hz)
         stated_dead = old or (reading.ups_hz is not None and not measured)
         # Compared between two such messages in a row: the first one may bring a last reading.
@@ -205,12 +192,7 @@ class _ServerSensor:
     ) -> Scan:
         scan = self._series.close(counts.reshape(self._geometry.scan_shape), arrival_ns, device_ns, vendor)
         self._come[:] = False
-        missing = int(np.count_nonzero(~scan.fresh))
-        self.counted["scans"] += 1
-        self.counted["missing_taxels"] += missing
-        self.counted["torn_wire"] += missing > 0
-        self.counted["torn_source"] += missing == 0 and scan.torn
-        self.counted["repeated"] += scan.repeated
+        count_scan(self.counted, scan)
         return scan if self._mounting is None else self._mounting.place(scan)
 
     def _vendor(self, reading: ServerReading) -> VendorReading:
@@ -221,10 +203,7 @@ class _ServerSensor:
 
 
 def _age_ns(reading: ServerReading, message: ServerMessage) -> int | None:
-    """Return the age of a reading when sent, by the server's clock alone, in [ns]; None if it is missing or impossible.
-
-    So only the time of sending is mapped to the host's clock, and old readings are detected even if all are old.
-    """
+    """Return the age of a reading when sent, by the server's clock alone, in [ns]; None if it is impossible."""
     if message.sent_s is None or reading.acquired_s is None:
         return None
     age_s = message.sent_s - reading.acquired_s

@@ -35,28 +35,19 @@ from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, LAST_UNIX_S, Base
 FILE_FORMAT: Final = "tactile-sensor"
 FILE_VERSION: Final = 1
 MOST_BYTES: Final = 1 << 16  # most bytes of a sensor file; a sensor takes 2 kB
-LONGEST_LINE_BYTES: Final = 2048
-"""Most bytes of a line, twice a line of all gains. The time of tomllib grows with the square of a key's dots: 60 kB
-took 27 s."""
+LONGEST_LINE_BYTES: Final = 2048  # twice a line of all gains; tomllib's time grows with the square of a key's dots
 _REMEDY: Final = "correct it, or write it again with edge-sr doctor --out"
-PARTS: Final = ("mounting", "force", "baseline", "gains")
-"""Parts of an entry that can be marked as assumed, or as measured on an emulated sensor."""
+PARTS: Final = ("mounting", "force", "baseline", "gains")  # that can be marked as assumed, or as emulated
 LARGEST_MM: Final = 1e5
 
 
 @dataclass(frozen=True)
 class PadFrame:
-    """Place of a pad in a frame of the robot: the middle of its face, x to the right, y down, z into the pad.
+    """Place of a pad in a frame of the robot: the middle of its face, x to the right, y down, z into the pad."""
 
-    Attributes:
-        parent: name of the robot's frame, such as "tool0".
-        place_mm: x, y, z of the middle of the face in the parent, in [mm].
-        quaternion: x, y, z, w of the turn from the parent's axes to the pad's.
-    """
-
-    parent: str
-    place_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    parent: str  # name of the robot's frame, such as "tool0"
+    place_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the middle of the face in the parent
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)  # from the parent's axes to the pad's
 
     def __post_init__(self) -> None:
         if not self.parent or self.parent.startswith("/") or not self.parent.isprintable() or " " in self.parent:
@@ -168,11 +159,7 @@ class SensorFile:
 
 
 def load_sensor_file(path: str | Path) -> SensorFile:
-    """Read a sensor file.
-
-    Raises:
-        SensorFileError: the file cannot be read, or a value is invalid; the message names the key.
-    """
+    """Read a sensor file, or raise a SensorFileError that names the key."""
     path = Path(path)
     try:
         content = read_bounded(path, MOST_BYTES)

@@ -34,11 +34,8 @@ LOCKED_S: Final = 5.0  # longest wait for another program that changes the file,
 def changing(path: str | Path) -> Iterator[None]:
     """Change a sensor file within a with statement, from its reading to its writing, while no other program does.
 
-    The lock is on the folder, since the file is replaced by a new one each time, and goes with the program. Where a
-    file system has no locks, none is taken.
-
-    Raises:
-        SensorFileError: another program holds the lock for too long.
+    The lock is on the folder, since the file is replaced by a new one each time. Where a file system has no locks, none
+    is taken. Raises SensorFileError where another program holds it for LOCKED_S.
     """
     try:
         folder = os.open(Path(path).parent, os.O_RDONLY)
@@ -63,12 +60,7 @@ def changing(path: str | Path) -> Iterator[None]:
 
 
 def save_sensor_file(path: str | Path, sensor_file: SensorFile, *, keep_before: bool = True) -> None:
-    """Write a sensor file in place; an existing one stays as NAME.bak, unless not `keep_before`.
-
-    Raises:
-        SensorFileError: the file cannot be written, or would hold no sensor, a baseline with a silent taxel, or a
-            program's own id map.
-    """
+    """Write a sensor file in place, or raise a SensorFileError; the one before stays as NAME.bak, if wanted."""
     path = Path(path)
     if not sensor_file.sensors:
         raise SensorFileError(f"{path}: not written, because nothing was measured: correct the findings first")

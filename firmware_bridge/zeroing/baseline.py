@@ -19,12 +19,11 @@ from firmware_bridge.in_place import read_bounded, write_in_place
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
-from firmware_bridge.strict_table import LEAST_POSITIVE, Table, is_number, numbers, one_of, reader, whole
+from firmware_bridge.strict_table import Table, is_number, numbers, one_of, reader, whole
 
 COUNTS_ON_CIRCLE: Final = 0x10000
 FEWEST_SCANS: Final = 100
-FEWEST_RECORDED: Final = 30
-"""Scans for a baseline of a recording, which cannot be extended: a pad may be free for only half a second there."""
+FEWEST_RECORDED: Final = 30  # of a recording, where a pad may be free for only half a second
 
 # Limits for 100 scans. A still, free pad shows noise of sigma 1.1..2.8 counts on x and y, 2..4.7 on z,
 # so its 5th to 95th percentile spans up to 12 and 20 counts, and the medians of its first and last third
@@ -49,42 +48,31 @@ _read_sensor: Final = reader(
     f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters",
 )
 _read_date: Final = reader(
-    lambda value: value is None or is_number(value, LEAST_POSITIVE, LAST_UNIX_S), "seconds since 1970, or null"
+    lambda value: value is None or is_number(value, 1, LAST_UNIX_S), "seconds since 1970, or null"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """Baseline of one sensor: the counts of its free pad.
-
-    Attributes:
-        sensor: name of the sensor.
-        counts: (3, rows, cols) float32 in 0..65536, read-only; NaN where a taxel was silent. These are subtracted:
-            `id` identifies them as they were taken, `moved` adds the drift since.
-        created_unix_s: time of its scans, in [s] since 1970; NaN if it is unknown.
-        scans: number of scans whose median it is.
-        origin: taken at this start-up, or later on demand, or loaded from a file; or from the very recording that is
-            played: "recording" where the pad is free, "unsure" where it may hold something all the time.
-        id: short text that identifies sensor, counts and time.
-    """
+    """Baseline of one sensor: the counts of its free pad."""
 
     sensor: str
+    # (3, rows, cols) in 0..65536, read-only; NaN where a taxel was silent. `id` identifies them as they were taken, and
+    # `moved` adds the drift since.
     counts: NDArray[np.float32]
-    created_unix_s: float
-    scans: int
+    created_unix_s: float  # time of its scans, in [s] since 1970; NaN if it is unknown
+    scans: int  # number of scans whose median it is
+    # Where it is of the very recording that is played: "recording" where the pad is free, "unsure" where it may hold
+    # something all the time.
     origin: Origin
-    id: str
+    id: str  # short text that identifies sensor, counts and time
 
     def __repr__(self) -> str:
         return f"<Baseline {self.id} of sensor {self.sensor}: {self.scans} scans, {self.origin}>"
 
     @classmethod
     def from_counts(cls, sensor: str, counts: NDArray[np.integer], created_unix_s: float) -> Self:
-        """Return the median of scans (n, 3, rows, cols), n > 0, whole ones, of a pad that was free and still.
-
-        Raises:
-            BaselineRefusedError: they are no such array, or a count is beyond 0..65535, as of an absent taxel.
-        """
+        """Return the median of whole scans (n, 3, rows, cols) of a free, still pad, or raise a BaselineRefusedError."""
         if not isinstance(counts, np.ndarray) or counts.dtype.kind not in "iuf" or np.ma.is_masked(counts):
             raise BaselineRefusedError(f"counts of sensor {sensor}: expected an array of numbers without a mask")
         if counts.ndim != 4 or not counts.size or not 0 <= counts.min() <= counts.max() < COUNTS_ON_CIRCLE:
@@ -118,8 +106,7 @@ def deformation(
 ) -> NDArray[np.float32]:
     """Return the difference of a scan's raw counts to the baseline, the short way round the circle of counts.
 
-    Shapes (3, rows, cols); signed counts in -32768..32768, NaN where a taxel is absent. Without a mounting the axes are
-    as wired.
+    Shapes (3, rows, cols); NaN where a taxel is absent. Without a mounting the axes are as wired.
     """
     half = COUNTS_ON_CIRCLE // 2
     # float32 holds halves exactly up to 2^23, so this does not round.
@@ -163,10 +150,8 @@ class BaselineEstimator:
         """Add the next scan, and return the baseline once there are enough.
 
         A scan is complete without the `silent` taxels (rows, cols), and the baseline NaN there. One left out once stays
-        so until there is a baseline, since an intermittent one would delay it for ever.
-
-        Raises:
-            BaselineRefusedError: the pad moved or was loaded. The estimator has begun again.
+        so until there is a baseline, since an intermittent one would delay it for ever. Begins again, and raises a
+        BaselineRefusedError, where the pad moved or was loaded.
         """
         if silent is not None and silent.any():
             self._silent = silent.copy() if self._silent is None else self._silent | silent
@@ -196,12 +181,9 @@ class BaselineEstimator:
 def save_baselines(
     path: str | Path, baselines: Iterable[Baseline], orders: Mapping[str, Sequence[int]] = MappingProxyType({})
 ) -> None:
-    """Write baselines, one per sensor, as one JSON file, in place; an existing file stays as NAME.bak.
+    """Write baselines, one per sensor, as one JSON file, or raise a RecordingError; the one before stays as NAME.bak.
 
     `orders` are those of the taxels of each sensor whose mounting differs from its id map.
-
-    Raises:
-        RecordingError: the file cannot be written.
     """
     path = Path(path)
     entries = [
@@ -227,11 +209,9 @@ def save_baselines(
 
 
 def load_baselines(path: str | Path, orders: Mapping[str, Sequence[int]] = MappingProxyType({})) -> dict[str, Baseline]:
-    """Read baselines, by sensor; `orders` are the present ones of the taxels, as in `save_baselines`.
+    """Read baselines, by sensor, or raise a RecordingError; `orders` are the present ones, as in `save_baselines`.
 
-    Raises:
-        RecordingError: the file cannot be read, or is no baseline file, was changed by hand, or its taxels lay in
-            another order, so that each would get the baseline of another one.
+    If its taxels lay in another order, each would get the baseline of another one.
     """
     path = Path(path)
     try:

@@ -19,43 +19,30 @@ from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 GAP_NS: Final = 5_000_000_000  # time without a scan after which the pad may have been replaced or moved, in [ns]
 COMMON_PER_S: Final = 20.0  # highest common drift that is followed, in [counts/s]: above any drift on record
-COMMON_COUNTS: Final = 50.0
-"""Largest common change ahead of the followed drift that is no touch: a pad turned over in the earth's field moves by
-36 counts; at this limit the summed z is still half of a contact's."""
-OWN_SHARE: Final = 0.65
-"""Largest own drift of a taxel as a share of the common drift: six tenths are seen, and a press has more than one."""
-STILL_COUNTS: Final = 7.0
-"""Largest difference of two blocks at rest: the highest noise measured is 4.7 counts, 1.6 for that difference."""
-STEP_COUNTS: Final = 15.0
-"""Change of rest level over a contact above which it is reported: more than noise and the end of a recovery cause."""
+COMMON_COUNTS: Final = 50.0  #
+OWN_SHARE: Final = 0.65  # most own drift of a taxel over the common one: six tenths are seen, and a press has over one
+STILL_COUNTS: Final = 7.0  # most between two blocks at rest: the highest noise measured is 4.7 counts, 1.6 for that
+STEP_COUNTS: Final = 15.0  # change of rest level that is reported: more than noise and the end of a recovery cause
 
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """Drift since zeroing: of all taxels on x, y, z, the most of a taxel beyond it, and the largest signed step.
+    """Drift since zeroing; all but the step is subtracted from readings."""
 
-    The step in rest level, 0 without one, stays in the readings; the others are subtracted from them.
-    """
-
-    common_counts: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    own_counts: float = 0.0
-    step_counts: float = 0.0
+    common_counts: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of all taxels on x, y, z
+    own_counts: float = 0.0  # the most of a taxel beyond it
+    step_counts: float = 0.0  # largest signed step in rest level, 0 without one
 
 
 class DriftTracker:
-    """Tracker of the rest level of one sensor.
-
-    Attributes:
-        counts: (3, rows, cols) float32, to be added to the baseline; a new array whenever it changes.
-        summary: the same in a few numbers, with the step that stays in the readings.
-        note: message to the user while a step lasts, with the figures from its beginning.
-    """
+    """Tracker of the rest level of one sensor."""
 
     def __init__(self, baseline: Baseline) -> None:
         """Start with an unmoved baseline; drift is followed once the pad has been at rest for a while."""
+        # (3, rows, cols), to be added to the baseline; a new array whenever it changes.
         self.counts: NDArray[np.float32] = np.zeros_like(baseline.counts)
-        self.summary = Drift()
-        self.note: str | None = None
+        self.summary = Drift()  # the same, with the step that stays in the readings
+        self.note: str | None = None  # message to the user while a step lasts
         self._baseline = baseline
         self._unzeroed = np.isnan(baseline.counts).any(axis=0)
         self._dead: NDArray[np.bool_] | None = None
@@ -71,8 +58,8 @@ class DriftTracker:
     def push(self, scan: Scan, contact: bool, dead: NDArray[np.bool_]) -> bool:
         """Process the next scan; return True if `counts`, `summary` or `note` have changed, or there is an event.
 
-        There is `contact` during a tap, and while the baseline is in doubt. The `dead` taxels (rows, cols) are ignored,
-        and are a new array only where they have changed.
+        There is `contact` during a tap, and while the baseline is in doubt. `dead` (rows, cols) is a new array only
+        where it has changed.
         """
         time_ns = scan.time_ns
         since_ns, self._last_ns = time_ns - self._last_ns, time_ns

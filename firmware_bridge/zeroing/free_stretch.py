@@ -19,18 +19,14 @@ from firmware_bridge.zeroing.baseline import (
 
 
 class Stretch(NamedTuple):
-    """Scans during which a pad is free and still: their rows (n,) in the recording, and counts (n, 3, rows, cols).
-
-    Attributes:
-        touched: True if something touches the pad elsewhere in the recording. Without it, a pad that holds something
-            all the time cannot be distinguished from a free one.
-        within_counts: how far the level of a taxel may be off, where the pad still recovers; None where it is still.
-    """
+    """Scans during which a pad is free and still: their rows (n,) in the recording, and counts (n, 3, rows, cols)."""
 
     rows: NDArray[np.intp]
     counts: NDArray[np.int32]
+    # True if something touches the pad elsewhere in the recording. Without it, a pad that holds something all the time
+    # cannot be distinguished from a free one.
     touched: bool
-    within_counts: float | None = None
+    within_counts: float | None = None  # how far a taxel may be off where the pad still recovers
 
     @property
     def opens(self) -> bool:
@@ -48,11 +44,8 @@ def free_stretch(counts: NDArray[np.int32]) -> Stretch:
 
     A grip can be as still as a free pad for half a second. So the stretch has to be the freest one, and no taxel of it
     may lie above the freest scans of the whole recording, as with an earlier baseline. Where the pad is still nowhere,
-    but was let go of, these are the freest scans.
-    Raw counts (n, 3, rows, cols) of all scans of a sensor; ABSENT where a taxel gave no reading.
-
-    Raises:
-        BaselineRefusedError: there is none, with the reason at the freest place.
+    but was let go of, these are the freest scans. Raw counts (n, 3, rows, cols) are of all scans of a sensor. Raises
+    BaselineRefusedError, with the reason at the freest place.
     """
     whole = (counts != ABSENT).all(axis=(1, 2, 3))
     whole[1:] &= (counts[1:] != counts[:-1]).any(axis=(1, 2, 3))  # a repeated scan is no second sample
@@ -84,10 +77,8 @@ def free_stretch(counts: NDArray[np.int32]) -> Stretch:
 
 
 def _touched(z: NDArray[np.int64], free: NDArray[np.int64]) -> bool:
-    """Return True if some scans are as far above those of a stretch as a contact; a few may be damaged.
-
-    A contact of 1.3 N raises the summed z by 1500 counts; a free pad warms by less within a recording.
-    """
+    """Return True if some scans are as far above those of a stretch as a contact; a few may be damaged."""
+    # A contact of 1.3 N raises the summed z by 1500 counts; a free pad warms by less within a recording.
     return bool((z > np.median(free) + 1500).sum() >= 5)
 
 

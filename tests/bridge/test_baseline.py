@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, REST, make_scan
+from edge_samples import BASELINE, REST
 from hostile_samples import one_line
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -61,18 +61,18 @@ def test_a_still_pad_gives_its_median():
     estimator = BaselineEstimator(clock=lambda: 1234.5)
     counts = still(100)
     baseline = zeroed(counts, estimator)
+    assert Baseline.from_counts("4", counts, 1234.5).id == baseline.id
+    for wrong, words in ((65_536, " to 65536, expected"), (ABSENT, "-1 to .*, expected")):
+        with pytest.raises(BaselineRefusedError, match=words):
+            Baseline.from_counts("6", np.where(counts == counts.max(), wrong, counts), 99.0)
     assert (baseline.counts == np.median(counts, axis=0)).all()
     assert baseline.counts.dtype == np.float32 and not baseline.counts.flags.writeable
     assert (baseline.sensor, baseline.scans, baseline.origin, baseline.created_unix_s) == ("4", 100, "start-up", 1234.5)
     assert baseline.age_s(1300.0) == 65.5 and estimator.scans == 0
+    for seed in range(1, 40):
+        zeroed(still(100, seed, noise_counts=(2.8, 2.8, 4.7)))  # the loudest pad on record
     with pytest.raises(ValueError, match="at least 3"):
         BaselineEstimator(min_scans=2)
-
-
-def test_noise_of_any_known_pad_is_accepted():
-    for seed in range(40):
-        zeroed(still(100, seed))
-    zeroed(still(100, 5, noise_counts=(2.8, 2.8, 4.7)))
 
 
 @pytest.mark.parametrize(
@@ -90,19 +90,10 @@ def test_noise_of_any_known_pad_is_accepted():
     ],
 )
 def test_motion_is_refused_from_the_first_count_beyond_a_limit(taken, refused, words):
-    axis = "xyz".index(words[0])
-    zeroed(moved(taken, axis))
+    axis, estimator = "xyz".index(words[0]), BaselineEstimator(min_scans=len(taken))
     with pytest.raises(BaselineRefusedError, match=rf"taxel \(3, 1\) {words}"):
-        zeroed(moved(refused, axis))
-
-
-def test_after_a_refusal_zeroing_starts_over():
-    estimator, counts = BaselineEstimator(), still(100)
-    counts[70:, 2, 1, 2] += 40
-    with pytest.raises(BaselineRefusedError):
-        zeroed(counts, estimator)
-    assert estimator.scans == 0
-    zeroed(still(100, 1), estimator)
+        zeroed(moved(refused, axis), estimator)
+    zeroed(moved(taken, axis), estimator)  # it has started over
 
 
 @pytest.mark.parametrize("silent", [None, np.arange(16).reshape(4, 4) == 0])
@@ -155,43 +146,20 @@ def test_deformation_is_the_short_way_round(rest, pressed, half, unknown):
     assert (seen[:, ~gaps] == pressed + half).all()
 
 
-def test_from_counts_takes_what_it_is_given():
-    counts = still(20)
-    counts[15:, 2] += 4000
-    baseline = Baseline.from_counts("6", counts, 99.0)
-    assert (baseline.counts == np.median(counts, axis=0)).all()
-    assert (baseline.sensor, baseline.scans, baseline.created_unix_s) == ("6", 20, 99.0)
-    counts[3, 1, 2, 2] = 65_536
-    with pytest.raises(BaselineRefusedError, match="to 65536, expected"):
-        Baseline.from_counts("6", counts, 99.0)
-
-
 def test_a_taxel_given_up_has_no_rest_until_the_next_zeroing():
-    counts = still(200)
+    """One that comes and goes does not put zeroing off; scans without another taxel are no samples meanwhile."""
+    counts = still(201)
+    counts[50, :, 0, 0] = ABSENT
     counts[:, :, 1, 1] = ABSENT
     counts[:20, :, 2, 2] = ABSENT
     one, two = np.zeros((2, 4, 4), dtype=bool)
     one[1, 1] = two[1, 1] = two[2, 2] = True
     estimator = BaselineEstimator()
     found = [estimator.push(scan, two if number < 20 else one) for number, scan in enumerate(scans_of(counts))]
-    assert [number for number, baseline in enumerate(found) if baseline is not None] == [99, 199]
-    for baseline, given_up in ((found[99], two), (found[199], one)):
+    assert [number for number, baseline in enumerate(found) if baseline is not None] == [100, 200]
+    for baseline, given_up in ((found[100], two), (found[200], one)):
         np.testing.assert_array_equal(np.isnan(baseline.counts), np.broadcast_to(given_up, (3, 4, 4)))
         np.testing.assert_allclose(baseline.counts[:, ~given_up], REST[:, ~given_up], atol=2)
-
-
-def test_a_taxel_that_comes_and_goes_does_not_put_zeroing_off():
-    """Scans without another taxel are no samples meanwhile."""
-    estimator = BaselineEstimator()
-    silent = np.arange(16).reshape(4, 4) == 0
-    for number in range(1000):
-        gone = number // 60 % 2 == 1
-        absent = (0,) * gone + (5,) * (number in (20, 70))
-        baseline = estimator.push(make_scan(number, absent=absent, noise=3), silent if gone else None)
-        if baseline is not None:
-            break
-    assert baseline is not None and number == 101
-    assert np.isnan(baseline.counts[:, 0, 0]).all() and np.isfinite(baseline.counts[:, 1:, :]).all()
 
 
 # Files: saved, loaded, written by hand and refused.
@@ -207,13 +175,10 @@ def with_cell(cell: object) -> list:
     return counts
 
 
-def test_the_id_stands_for_sensor_counts_and_time():
+def test_the_id_is_of_sensor_counts_and_time_not_of_drift():
     others = [made(sensor="6"), made(REST + 1), made(created_unix_s=1_001.0)]
     assert len({BASELINE.id, *(other.id for other in others)}) == 4
     assert made().id == BASELINE.id == "d148ecd3"
-
-
-def test_one_that_has_drifted_keeps_its_id_and_goes_round_the_circle():
     drifted = made().moved(np.full(REST.shape, 65_000.0))
     assert drifted.id == made().id and drifted.counts == pytest.approx((REST + 65_000) % 65_536)
 
@@ -242,8 +207,7 @@ def test_a_baseline_of_another_order_of_taxels_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("cell", "created_unix_s", "scans"),
-    [(16_000, 1_790_000_000, 100), (0, LAST_UNIX_S, 1), (65_535.9, 1e-6, 2**31 - 1), (1, np.nan, 1)],
+    ("cell", "created_unix_s", "scans"), [(0, LAST_UNIX_S, 1), (65_535.9, 1, 2**31 - 1), (1, np.nan, 1)]
 )
 def test_a_baseline_written_by_hand_as_the_docs_say_needs_no_id(tmp_path, cell, created_unix_s, scans):
     path = tmp_path / "zero.json"
@@ -275,7 +239,7 @@ WRONG = {
         *(None, [[[]], [[]], [[]]], REST.tolist()[:2], REST.ravel().tolist(), [REST.tolist()] * 3),
         *([[[1, 2], [3]], [[4]], [[5]]], *map(with_cell, (65_536, -1, float("nan"), False))),
     ],
-    "id": ["00000000", None],
+    "id": ["00000000", None],  # as where the counts were changed
 }
 """Values that cannot be, by key."""
 
@@ -291,14 +255,6 @@ def test_a_value_that_cannot_be_is_refused_by_its_key(tmp_path, key, value):
     with pytest.raises(RecordingError, match=rf"zero\.json.*{shown}.*zero again") as refused:
         load_baselines(path)
     assert one_line(refused)
-
-
-def test_counts_that_were_changed_are_refused_by_their_id(tmp_path):
-    path = tmp_path / "zero.json"
-    save_baselines(path, [made()])
-    path.write_text(path.read_text().replace("16000", "16001", 1))
-    with pytest.raises(RecordingError, match=r"'id': .*the file was changed"):
-        load_baselines(path)
 
 
 @pytest.mark.parametrize("text", [b"", b"[1]", b"NaN", b"1" * 10_000, b"\xff", b"[" * 100_000, None])

@@ -99,11 +99,10 @@ def test_reads_that_are_late_drop_nothing(stall_ms) -> None:
 
 def test_a_device_that_begins_anew_is_still_a_clock() -> None:
     clock, got = times([ms * 1000 % 1_000_000 for ms in range(0, 20_000, 10)], range(0, 20_000, 10))
-    assert not clock.dropped
-    assert got[100] is not None and got[100].host_ns == HOST_NS + 1000 * MS, "mapped anew"
+    assert not clock.dropped and got[100].host_ns == HOST_NS + 1000 * MS, "mapped anew"
 
 
-@pytest.mark.parametrize("back_ms", [-50, 0, 3, 12, 15, 20, 50, 80, 99, 3000])
+@pytest.mark.parametrize("back_ms", [-50, 3, 12, 15, 99, 3000])
 def test_a_wall_clock_that_is_set_back_costs_no_scan(back_ms: int) -> None:
     """Stamps of socketcan and of a server are of one. No scan is lost, so none may be reported missing."""
     clock, cadence, noise = DeviceClock(US, None), Cadence(100.0), random.Random(back_ms)

@@ -69,19 +69,17 @@ def test_a_step_of_the_wall_clock_does_not_hurt(bus, step_s):
             now_ns[0] += 10_000_000
 
 
-@pytest.mark.parametrize("begun_us", [0, 10**9])
-def test_stamps_that_count_from_the_opening_make_nothing_old(bus, begun_us):
-    """Count stamps from each opening: those after an outage may lie ahead of the earlier ones by any time."""
-    now_ns, delays_ns = [5 * 10**12], []
+def test_stamps_that_count_from_the_opening_make_nothing_old(bus):
+    """Those after an outage may lie ahead of the earlier ones by any time."""
+    now_ns = [5 * 10**12]
     link = link_to(bus, clock_ns=lambda: now_ns[0])
-    for opened_us in (1000, 2_000_000 + begun_us):
+    for opened_us in (1000, 2_000_000, 10**9):
         with link:
             for frame in frames_of(1, seed=opened_us):
                 bus.send(message_of(frame, timestamp=opened_us / 1e6))
             (scan,) = read_all(link, 16)
-            delays_ns.append(scan.time_ns - scan.not_before_ns)
+            assert scan.not_before_ns == scan.time_ns
         now_ns[0] += 9 * 10**9
-    assert delays_ns == [0, 0]
 
 
 # Errors of the bus.
@@ -132,14 +130,11 @@ def test_a_bus_that_is_off_stays_so_however_often_it_is_opened(lasting, told, wo
     counters = link.counters()
     assert counters["reopenings"] >= 3 and counters["bus_off"] + counters["error_passive"] == 1
     assert lasting(FRAME).link.trouble is None, "what told that it is over may have come meanwhile"
-
-
-def test_a_network_that_was_down_begins_anew(lasting):
-    assert "bus-off" in (lasting(BUS_OFF).link.trouble or "")
+    assert words in (lasting(*told).link.trouble or "")
     for _ in range(3):
         lasting(cable=False)
     lasting()
-    assert lasting().link.trouble is None
+    assert lasting().link.trouble is None, "a network that was down begins anew"
 
 
 def test_a_bus_that_says_it_is_off(bus, monkeypatch):
@@ -166,7 +161,6 @@ FILTERS = {"can_filters": [{"can_id": 0, "can_mask": 0, "extended": False}]}
     [
         ("kvaser", "0", "device", {"channel": 0, "bitrate": 1_000_000}),
         ("pcan", "PCAN_USBBUS1", "device", {"channel": "PCAN_USBBUS1", "bitrate": 1_000_000}),
-        ("virtual", "0", "emulated", {"channel": "0"}),
         ("udp_multicast", "239.74.163.2", "emulated", {"channel": "239.74.163.2"}),
         ("socketcan", "can0", "device", {"channel": "can0"} | FILTERS),
         ("socketcan", "vcan0", "emulated", {"channel": "vcan0"} | FILTERS),
@@ -182,47 +176,30 @@ def test_what_python_can_is_asked_for_and_what_is_emulated(opens, networks, inte
     assert link.kind == kind and asked == [{"interface": interface, "ignore_config": True} | settings]
 
 
-@pytest.mark.parametrize(
-    ("interface", "words"),
-    [
-        ("slcan", "use slcan:"),
-        ("gs_usb", "use gs_usb:"),
-        ("socketcam", r"expected can:INTERFACE:CHANNEL of (?!.*(slcan|gs_usb)).*kvaser.*pcan.*socketcan.*virtual"),
-    ],
-)
-def test_interfaces_that_are_refused(interface, words):
-    with pytest.raises(SourceError, match=words):
-        CanBusLink(interface, "0")
-
-
-def test_python_can_is_not_installed(monkeypatch):
+def test_interfaces_that_are_refused(monkeypatch):
+    for interface, words in {
+        "slcan": "use slcan:",
+        "gs_usb": "use gs_usb:",
+        "socketcam": r"expected can:INTERFACE:CHANNEL of (?!.*(slcan|gs_usb)).*kvaser.*pcan.*socketcan.*virtual",
+    }.items():
+        with pytest.raises(SourceError, match=words):
+            CanBusLink(interface, "0")
+    for interface in ("pcan", "kvaser", "neovi", "socketcand", "vector"):  # their drivers are not there
+        with pytest.raises(DeviceError, match=rf"^can:{interface}:0: cannot be opened"):
+            CanBusLink(interface, "0").__enter__()
     monkeypatch.setitem(sys.modules, "can", None)
     with pytest.raises(DeviceError, match=r"pip install '.+\[can\]'"):
         CanBusLink("virtual", "x")
 
 
-@pytest.mark.parametrize("interface", ["pcan", "kvaser", "neovi", "socketcand", "vector"])
-def test_a_driver_that_is_not_there(interface):
-    with pytest.raises(DeviceError, match=rf"^can:{interface}:0: cannot be opened"):
-        CanBusLink(interface, "0").__enter__()
-
-
-@pytest.mark.parametrize(
-    ("channel", "words"),
-    [
-        ("can0", r"can0 is down: sudo ip link set can0 up type can bitrate 1000000 restart-ms 100$"),
-        ("vcan0", r"vcan0 is down: sudo ip link set vcan0 up$"),
-        ("can2", r"no CAN network can2: .*seen: can0, can1, vcan0$"),
-        ("eth0", r"no CAN network eth0: .*seen: can0, can1, vcan0$"),
-    ],
-)
-def test_a_network_that_is_not_there_or_down(networks, channel, words):
+def test_a_network_that_is_not_there_or_down(networks):
     make_network(networks, "can0", up=False, driver="gs_usb")
-    make_network(networks, "can1", up=True)
     make_network(networks, "eth0", up=True, kind="1")
-    make_network(networks, "vcan0", up=False)
-    with pytest.raises(DeviceError, match=words) as refused:
-        CanBusLink("socketcan", channel).__enter__()
-    if channel == "can0":  # `edge-sr devices` advises the same
-        listed = can_interfaces(networks)[0]
-        assert str(refused.value) == f"CAN network can0 {listed.problems[0]}"
+    listed = can_interfaces(networks)[0]  # `edge-sr devices` advises the same
+    for channel, words in {
+        "can0": rf"can0 is down: sudo ip link set can0 up .*{listed.problems[0][-10:]}$",
+        "can2": "no CAN network can2: .*seen: can0$",
+        "eth0": "no CAN network eth0: .*seen: can0$",
+    }.items():
+        with pytest.raises(DeviceError, match=words):
+            CanBusLink("socketcan", channel).__enter__()

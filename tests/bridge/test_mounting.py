@@ -15,29 +15,21 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.recording.csv_reader import csv_header
-from firmware_bridge.scans.can_id_maps import (
-    ID_MAPS,
-    LAYOUT_A_MAP,
-    LAYOUT_B_MAP,
-    USPA44_MAP,
-    XR1944_MAP,
-)
+from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP, XR1944_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting, placed_map
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.zeroing.baseline import deformation
 
-DATA = bytes.fromhex("937E317E1593120F")
 BACKWARDS = [3, 2, 1, 0]
 
 
 @pytest.mark.parametrize(
     ("can_id", "data", "place", "counts"),
     [  # the first two as a sensor sent them, with what its maker's server read in them
-        (0x004, DATA, (0, 3), [32305, 32277, 37650]),
+        (0x004, bytes.fromhex("937E317E1593120F"), (0, 3), [32305, 32277, 37650]),
         (0x104, bytes.fromhex("938406805591BB0C"), (1, 3), [33798, 32853, 37307]),
-        (0x004, b"\0" + DATA[1:7] + b"\xff", (0, 3), [32305, 32277, 37650]),
         (0x33F, b"\1" + bytes.fromhex("0000 8000 FFFF") + b"\1", (3, 0), [0, 32768, 65535]),
     ],
 )
@@ -53,10 +45,8 @@ def test_golden_frames(can_id, data, place, counts):
     [
         (USPA44_MAP, "4", [row << 8 | col << 4 | 4 for row in range(4) for col in BACKWARDS]),
         (XR1944_MAP, "4", [row // 2 << 8 | row % 2 << 6 | col << 4 | 4 for row in range(4) for col in BACKWARDS]),
-        (LAYOUT_A_MAP, "1", range(0x710, 0x720)),
         (LAYOUT_A_MAP, "7", range(0x770, 0x780)),
         (LAYOUT_B_MAP, "1a", range(0x100, 0x110)),
-        (LAYOUT_B_MAP, "1b", range(0x110, 0x120)),
         (LAYOUT_B_MAP, "3b", range(0x310, 0x320)),
     ],
 )
@@ -121,8 +111,7 @@ def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
 
 @pytest.mark.parametrize("mounting", [Mounting(swap_xy=True), Mounting(signs=(1, 1, -1)), TURNED])
 def test_forces_of_the_vendors_server_are_turned(mounting):
-    of_server = {"1": mounting}
-    plain, turned = ServerScans(), ServerScans(prefix="", mountings=of_server)
+    plain, turned = ServerScans(), ServerScans(mountings={"1": mounting})
     text = message(1, sensor_entry(), sensor_entry())
     expected, scans = plain.feed(text, 0), turned.feed(text, 0)
     assert [scan.sensor for scan in ServerScans(prefix="left/").feed(text, 0)] == ["left/1", "left/2"]
@@ -141,32 +130,21 @@ def test_what_a_mounting_moves_and_what_costs_nothing():
 
 def test_deformation_is_corrected_once():
     scan = make_scan(press_counts=900, absent=(2,))
-    mounting = Mounting(signs=(1, 1, -1))
-    plain, corrected = deformation(scan.counts, BASELINE), deformation(scan.counts, BASELINE, mounting)
-    assert corrected[2, 1, 1] == -900 and np.isnan(corrected[:, 0, 2]).all()
+    plain, corrected = (deformation(scan.counts, BASELINE, mounting) for mounting in (None, Mounting(signs=(1, 1, -1))))
+    assert corrected[2, 1, 1] == -900 == -plain[2, 1, 1] and np.isnan(corrected[:, 0, 2]).all()
     assert np.array_equal(corrected[:2], plain[:2], equal_nan=True)
-    assert plain[2, 1, 1] == 900
 
 
-@pytest.mark.parametrize(
-    ("settings", "word"),
-    [
-        ({"order": (0,) * 16}, "each of 0..15 once"),
-        ({"order": tuple(range(15))}, "each of 0..15 once"),
-        ({"signs": (1, 0, 1)}, "three of 1 and -1"),
-    ],
-)
-def test_a_mounting_that_cannot_be_is_refused(settings, word):
-    with pytest.raises(ValueError, match=word):
-        Mounting(**settings)
-
-
-@pytest.mark.parametrize(("taxels", "mounted"), [(24, 16), (16, 24)])
-def test_csv_of_another_pad_than_its_mounting_is_refused(tmp_path, taxels, mounted):
-    (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(taxels)), ",".join(["1000"] * 3 * taxels), ""]))
-    mounting = Mounting(tuple(range(mounted))[::-1], taxel_count=mounted)
-    with pytest.raises(SourceError, match=rf"4\.csv has {taxels} taxels, .* sensor 4 has {mounted}: leave out"):
-        open_sources([f"replay:{tmp_path}/4.csv"], 100.0, mountings={"4": mounting})
+def test_a_mounting_that_cannot_be_is_refused(tmp_path):
+    for order in ((0,) * 16, tuple(range(15))):
+        with pytest.raises(ValueError, match=r"each of 0\.\.15 once"):
+            Mounting(order)
+    with pytest.raises(ValueError, match="three of 1 and -1"):
+        Mounting(signs=(1, 0, 1))
+    # A CSV is of another pad.
+    (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(24)), ",".join(["1000"] * 3 * 24), ""]))
+    with pytest.raises(SourceError, match=r"4\.csv has 24 taxels, .* sensor 4 has 16: leave out"):
+        open_sources([f"replay:{tmp_path}/4.csv"], 100.0, mountings={"4": Mounting()})
 
 
 def test_csv_of_the_vendors_server_alone_is_put_in_place(tmp_path):

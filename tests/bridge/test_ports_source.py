@@ -12,7 +12,7 @@ from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
 from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.registry import FORMS, open_sources
-from firmware_bridge.links.serial_ports import PluggedAdapter, Port, find_adapter, find_by_serial, serial_ports
+from firmware_bridge.links.serial_ports import PluggedAdapter, Port, find_adapter, serial_ports
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import ID_MAPS
 
@@ -43,24 +43,17 @@ def test_the_ports_of_this_machine(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("product", "manufacturer", "adapter"),
+    ("words", "adapter"),
     [
-        ("USB-CAN Plus", "VScom", True),
-        ("USB-CAN Plus", None, True),
-        (None, None, True),
-        ("CANUSB", "LAWICEL", True),
-        ("3D SCANNER", "CANON", False),
-        (None, "Robotiq", False),
+        *((words, True) for words in (("USB-CAN Plus", None), (None, None), ("CANUSB", "LAWICEL"))),
+        *((words, False) for words in (("3D SCANNER", "CANON"), (None, "Robotiq"))),
     ],
 )
-def test_of_a_chip_that_many_devices_have_the_words_decide(product, manufacturer, adapter):
-    port = VSCOM._replace(product=product, manufacturer=manufacturer)
-    assert port.adapter == ("VScom USB-CAN Plus" if adapter else None)
+def test_of_a_chip_that_many_devices_have_the_words_decide(words, adapter):
+    named = dict(zip(("product", "manufacturer"), words, strict=True))
+    assert VSCOM._replace(**named).adapter == ("VScom USB-CAN Plus" if adapter else None)
     # Others have ids of their own.
-    assert CANABLE._replace(product=product, manufacturer=manufacturer).adapter == "CANable, slcan firmware"
-    if not adapter:
-        with pytest.raises(NoDeviceError, match="no known adapter"):
-            find_adapter([port])
+    assert CANABLE._replace(**named).adapter == "CANable, slcan firmware"
 
 
 @pytest.mark.parametrize(
@@ -82,78 +75,60 @@ def test_the_one_known_adapter(ports, found):
     assert all(str(port) in str(refused.value) for port in ports) and "--source demo" in str(refused.value)
 
 
-def test_a_serial_number_that_no_port_has_or_several():
-    for ports in ([VSCOM], [SECOND_VSCOM, SECOND_VSCOM]):
-        with pytest.raises(NoDeviceError, match=r"port with serial number D30XXXXX, .*seen: /dev/ttyUSB"):
-            find_by_serial("D30XXXXX", ports)
-
-
-@pytest.fixture
-def two_vscom(plugged):
+@pytest.mark.parametrize(
+    ("text", "kind", "device", "line"),
+    [
+        ("slcan:/dev/by-id/usb@1@9600", SlcanSerialLink, "device", ("/dev/by-id/usb@1", 9600)),
+        ("slcan:/dev/my=port", SlcanSerialLink, "device", ("/dev/my=port", 3_000_000)),
+        ("slcan:serial=D30BL366@1000000", SlcanSerialLink, "device", ("/dev/ttyUSB0", 1_000_000)),
+        ("gs_usb:0039", GsUsbLink, "device", None),
+        ("can:virtual:a:b", CanBusLink, "emulated", None),
+        ("demo", DemoLink, "emulated", ("", 3_000_000)),
+    ],
+)
+def test_sources(plugged, text, kind, device, line):
     plugged += [BUILT_IN, VSCOM, SECOND_VSCOM]
-    return plugged
+    (link,) = open_sources([text], demo_recording="demo.npz")
+    assert isinstance(link, kind) and (link.name, link.kind, link.serial_line()) == (text, device, line)
 
 
-@pytest.mark.parametrize(
-    ("text", "port", "baudrate"),
-    [
-        ("slcan:/dev/by-id/usb@1@9600", "/dev/by-id/usb@1", 9600),
-        ("slcan:/dev/my=port", "/dev/my=port", 3_000_000),
-        ("slcan:serial=D30BL366@1000000", "/dev/ttyUSB0", 1_000_000),
-    ],
-)
-def test_slcan_sources(two_vscom, text, port, baudrate):
-    (link,) = open_sources([text])
-    assert isinstance(link, SlcanSerialLink)
-    assert (link.port, link.baudrate, link.name, link.kind) == (port, baudrate, text, "device")
-
-
-@pytest.mark.parametrize(
-    ("text", "link", "kind"),
-    [
-        ("gs_usb", GsUsbLink, "device"),
-        ("gs_usb:0039", GsUsbLink, "device"),
-        ("can:virtual:a:b", CanBusLink, "emulated"),
-        ("demo", DemoLink, "emulated"),
-    ],
-)
-def test_other_sources(text, link, kind):
-    (opened,) = open_sources([text], demo_recording="demo.npz")
-    assert isinstance(opened, link) and (opened.name, opened.kind) == (text, kind)
-
-
-def test_no_source_is_the_one_adapter_and_never_a_pretended_one(two_vscom):
+def test_no_source_is_the_one_adapter_and_never_a_pretended_one(plugged):
+    plugged += [BUILT_IN, VSCOM, SECOND_VSCOM]
     with pytest.raises(NoDeviceError, match="--source demo"):
         open_sources([], demo_recording="demo.npz")
-    two_vscom.remove(SECOND_VSCOM)
+    plugged[1:] = [VSCOM, VSCOM]
+    for serial_number in ("D30BL366", "D30XXXXX"):  # which two have, and none
+        with pytest.raises(NoDeviceError, match=rf"port with serial number {serial_number}, .*seen: /dev/ttyS"):
+            open_sources([f"slcan:serial={serial_number}"])
+    plugged[1:] = [VSCOM]
     (link,) = open_sources([])
     assert isinstance(link, SlcanSerialLink) and (link.port, link.name) == ("/dev/ttyUSB0", "slcan:/dev/ttyUSB0")
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["", "slcan", "slcan:", "slcan:@9600", "slcan:serial=", "slcan:serial=@9600", "replay", "replay:", "demo:", "Demo",
-     "gs_usb:", "gs_usb0", "can", "can:", "can:socketcan", "can:socketcan:"],
-)  # fmt: skip
-def test_texts_that_are_no_source(text):
-    with pytest.raises(SourceError) as refused:
-        open_sources([text], demo_recording="demo.npz")
-    assert repr(text) in str(refused.value) and all(form in str(refused.value) for form in FORMS)
-
-
-@pytest.mark.parametrize(
-    ("text", "meant"),
-    [
-        ("/dev/ttyUSB0", "slcan:/dev/ttyUSB0"),
-        ("can0", "can:socketcan:can0"),
-        ("ws://10.0.0.5:5000", "xela-server:ws://10.0.0.5:5000"),
-        ("press.mcap", "replay:press.mcap"),
-    ],
-)
-def test_a_source_without_its_form_is_told_what_was_meant(text, meant):
-    with pytest.raises(SourceError) as refused:
-        open_sources([text])
-    assert str(refused.value) == f"source is {text!r}: did you mean {meant}?"
+def test_texts_that_are_no_source():
+    no_form = [
+        "",
+        "slcan",
+        "slcan:@9600",
+        "slcan:serial=@9600",
+        "replay:",
+        "demo:",
+        "Demo",
+        "gs_usb:",
+        "can:socketcan:",
+    ]
+    for text in no_form:
+        with pytest.raises(SourceError) as refused:
+            open_sources([text], demo_recording="demo.npz")
+        assert repr(text) in str(refused.value) and all(form in str(refused.value) for form in FORMS)
+    for text, form in {
+        "/dev/ttyUSB0": "slcan:",
+        "can0": "can:socketcan:",
+        "ws://10.0.0.5:5000": "xela-server:",
+        "press.mcap": "replay:",
+    }.items():
+        with pytest.raises(SourceError, match=rf"^source is '{text}': did you mean {form}{text}\?$"):
+            open_sources([text])
 
 
 @pytest.mark.parametrize("baud", ["", "fast", "0", "-1", "²", "0115200", "99999999999", "9" * 5000])
@@ -171,13 +146,12 @@ def test_replay_sources(tmp_path):
             assert {scan.sensor for _ in range(2) for scan in link.read(1.0)} == sensors
 
 
-@pytest.mark.parametrize("model", ["XR1944", "A"])
-def test_the_id_map_is_the_one_asked_for(tmp_path, model):
-    rig, (sensor, *_) = SlcanRig(tmp_path, None), sorted({sensor for sensor, _ in ID_MAPS[model].taxels.values()})
-    frames = [CanFrame(can_id, bytes(8)) for can_id, _ in ID_MAPS[model].wire_order(sensor)]
-    (opened,) = open_sources([rig.name], model=ID_MAPS[model])
+def test_the_id_map_is_the_one_asked_for(tmp_path):
+    rig = SlcanRig(tmp_path, None)
+    frames = [CanFrame(can_id, bytes(8)) for can_id, _ in ID_MAPS["XR1944"].wire_order("4")]
+    (opened,) = open_sources([rig.name], model=ID_MAPS["XR1944"])
     with opened as link:
-        assert [(scan.sensor, scan.complete) for scan in rig.read(link, frames)] == [(sensor, True)]
+        assert [(scan.sensor, scan.complete) for scan in rig.read(link, frames)] == [("4", True)]
     rig.close()
 
 

@@ -33,12 +33,9 @@ def only_reading(entry):
 
 def test_axes_and_places():
     """x, y, z of one taxel side by side; taxels row by row from the top left."""
-    entry = sensor_entry(data=list(range(48)), calibrated=[float(value) for value in range(48)])
-    reading, _ = only_reading(entry)
-    counts = reading.counts.reshape(3, 4, 4)
-    assert counts[:, 0, 0].tolist() == [0, 1, 2] and counts[:, 0, 1].tolist() == [3, 4, 5]
-    assert counts[:, 1, 0].tolist() == [12, 13, 14] and counts[:, 3, 3].tolist() == [45, 46, 47]
-    assert (reading.newtons == counts).all()
+    reading, _ = only_reading(sensor_entry(data=list(range(48)), calibrated=[float(value) for value in range(48)]))
+    expected = np.arange(48).reshape(4, 4, 3).transpose(2, 0, 1)
+    assert (reading.counts.reshape(3, 4, 4) == expected).all() and (reading.newtons == expected).all()
 
 
 @pytest.mark.parametrize(
@@ -81,32 +78,27 @@ def test_other_sensors_are_named_and_left_out():
 
 
 @pytest.mark.parametrize(
-    ("key", "field", "absent", "bad"),
+    ("key", "field", "bad"),
     [
-        ("ups", "ups_hz", [None], ["58", *([1.0] * 15 + end for end in ([], [-1.0], [1e9], [NAN]))]),
-        (
-            "calibrated",
-            "newtons",
-            [None],
-            [[0.0] * 16, *([0.0] * 47 + [end] for end in (float("inf"), 10**400, 1001, True))],
-        ),
-        ("temp", "temperature_k", [None, [0.0] * 16], [[25.0] * 16, [300.0] * 17]),
-        ("time", "acquired_s", [None], ["now", True, -1, 1e300, NAN]),
+        ("ups", "ups_hz", ["58", *([1.0] * 15 + end for end in ([], [-1.0], [1e9], [NAN]))]),
+        ("calibrated", "newtons", [[0.0] * 16, *([0.0] * 47 + [end] for end in (float("inf"), 10**400, 1001, True))]),
+        ("temp", "temperature_k", [[25.0] * 16, [300.0] * 17]),
+        ("time", "acquired_s", ["now", True, -1, 1e300, NAN]),
     ],
 )
-def test_what_else_is_wrong_costs_itself_alone(key, field, absent, bad):
-    cases = [(sensor_entry() | {key: None}, {})]  # a null is as good as nothing
-    cases += [(sensor_entry(**{key: value}), {}) for value in absent]
-    cases += [(sensor_entry(**{key: value}), {"bad_values": 1}) for value in bad]
-    for entry, counters in cases:
+def test_what_else_is_wrong_costs_itself_alone(key, field, bad):
+    cases = [(sensor_entry(**{key: value}), {"bad_values": 1}) for value in bad]
+    for entry, counters in [(sensor_entry() | {key: None}, {}), (sensor_entry(**{key: None}), {}), *cases]:
         reading, counted_now = only_reading(entry)
         assert (reading.counts.reshape(3, 4, 4) == REST_COUNTS).all()
         assert getattr(reading, field) is None and counted_now == counters, entry.get(key)
 
 
-def test_a_taxel_without_thermometer():
+def test_a_taxel_without_thermometer_or_a_sensor():
     reading, _ = only_reading(sensor_entry(temp=[0.0] + [301.5] * 15))
     assert np.isnan(reading.temperature_k[0, 0]) and np.isnan(reading.temperature_k).sum() == 1
+    reading, counters = only_reading(sensor_entry(temp=[0.0] * 16))
+    assert reading.temperature_k is None and counters == {}
 
 
 @pytest.mark.parametrize(
@@ -225,14 +217,7 @@ def test_a_server_that_states_nothing_but_changes_is_used(unknown):
     assert [scan for scan in late if scan.time_ns > 3100 * MS] == [] and server.scans.trouble is not None
 
 
-@pytest.mark.parametrize(
-    "dead",
-    [
-        pytest.param({"ups": 0.0}, id="ups falls to 0"),
-        pytest.param({"time_s": UNIX_S}, id="its time stands still"),
-        pytest.param({"taxels": 15}, id="nothing usable is said of it"),
-    ],
-)
+@pytest.mark.parametrize("dead", [{"ups": 0.0}, {"time_s": UNIX_S}, {"taxels": 15}], ids=str)
 def test_a_dead_cable_gives_no_scan_and_is_told_of(dead):
     """However long the server goes on with the last reading."""
     server = Server()
@@ -248,7 +233,7 @@ def test_a_dead_cable_gives_no_scan_and_is_told_of(dead):
     assert server.say(5020, cycle(21)) and server.scans.trouble is None
 
 
-@pytest.mark.parametrize("set_by_s", [0.0, -3600.0, 3600.0])
+@pytest.mark.parametrize("set_by_s", [-3600.0, 3600.0])
 def test_a_sensor_that_died_long_ago_stays_dead(set_by_s):
     """The age of its last reading would then be unreliable, or lie in the future."""
     server = Server()
@@ -268,43 +253,31 @@ def test_a_slow_taxel_does_not_hold_up_the_others():
         counts = cycle(step, range(15))
         counts[:, 15] += step // 20
         scans += server.say(10 * step, counts, ups=[100.0] * 15 + [5.0])
-    assert len(scans) == 100
-    assert sum(scan.complete for scan in scans) in (5, 6, 7, 8, 9, 10)
-
-
-def test_what_the_vendor_says_besides():
-    (scan,) = Server().say(0)
-    assert scan.vendor.temperature_k.shape == scan.vendor.ups_hz.shape == (4, 4)
-    assert scan.vendor_force_n == (2.0, 2.0, 2.0)
-    (torn,) = Server().say(0, ups=[100.0] * 15 + [0.0])
-    assert torn.vendor_force_n is None  # of one taxel it is an old one
-
-
-CONNECTED = "connected"
+    assert len(scans) == 100 and 5 <= sum(scan.complete for scan in scans) <= 10
+    assert scans[0].vendor.temperature_k.shape == scans[0].vendor.ups_hz.shape == (4, 4)
+    # A force is of all taxels, and of one that is old there is none.
+    assert {scan.vendor_force_n for scan in scans if scan.complete} == {(2.0, 2.0, 2.0)}
+    assert {scan.vendor_force_n for scan in scans if not scan.complete} == {None}
 
 
 @pytest.mark.parametrize(
     ("numbers", "scans", "counted"),
     [
-        ([5, 5, 6, 8, 8, 11], [1, 0, 1, 1, 0, 1], {"repeated": 2, "missed": 3}),
-        ([5000, 0, 1], [1, 1, 1], {"restarts": 1}),
-        ([5000, CONNECTED, 0], [1, 1], {}),
-        ([1, 1 << 62, 2, 3], [1, 1, 1, 1], {"restarts": 2}),
-        ([1, 1 + MOST_MISSED, 2 + 2 * MOST_MISSED], [1, 1, 1], {"missed": MOST_MISSED - 1, "restarts": 1}),
+        ([5, 5, 6, 8, 8, 11], [1, 0, 1, 1, 0, 1], (2, 3, 0)),
+        ([5000, 0, 1], [1, 1, 1], (0, 0, 1)),
+        ([5000, None, 0], [1, 0, 1], (0, 0, 0)),
+        ([1, 1 << 62, 2, 3], [1, 1, 1, 1], (0, 0, 2)),
+        ([1, 1 + MOST_MISSED, 2 + 2 * MOST_MISSED], [1, 1, 1], (0, MOST_MISSED - 1, 1)),
     ],
 )
 def test_messages_are_taken_in_order_and_a_new_count_is_known(numbers, scans, counted):
     """By a new connection, a number out of a hat, or one below the last: a connection keeps the order."""
     server, got = Server(), []
     for step, number in enumerate(numbers):
-        if number == CONNECTED:
-            server.scans.begin()
-        else:
-            got.append(server.say(10 * step, cycle(step), number=number))
+        got.append(server.scans.begin() or [] if number is None else server.say(10 * step, cycle(step), number=number))
     assert [len(some) for some in got] == scans
     assert [scan.number for some in got for scan in some] == list(range(sum(scans))), "numbering goes on"
-    told = server.counted("repeated_messages", "missed_messages", "server_restarts")
-    assert told == tuple(counted.get(name, 0) for name in ("repeated", "missed", "restarts"))
+    assert server.counted("repeated_messages", "missed_messages", "server_restarts") == counted
 
 
 def test_memory_is_bounded():
@@ -319,14 +292,3 @@ def test_when_it_was_acquired_unless_that_cannot_be(age_ms):
     (scan,) = [*server.say(0), *server.say(10, cycle(1), age_ms=age_ms)][1:]
     expected_ns = age_ms * MS if 0 < age_ms < 1000 else None
     assert (scan.device_ns and scan.time_ns - scan.device_ns) == (expected_ns and pytest.approx(expected_ns, abs=2000))
-
-
-@pytest.mark.parametrize("step_s", [3600.0, -3600.0, 0.05, -0.05])
-def test_a_step_of_the_servers_clock_does_not_hurt(step_s):
-    server = Server()
-    for step in range(20):
-        server.say(10 * step, cycle(step))
-    server.clock_s += step_s
-    scans = [scan for step in range(20, 60) for scan in server.say(10 * step, cycle(step))]
-    assert len(scans) == 40
-    assert all(scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns <= 51 * MS for scan in scans)

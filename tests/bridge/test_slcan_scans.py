@@ -2,12 +2,12 @@
 
 import random
 
+from bridge_samples import cycle_lines
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
 
@@ -34,26 +34,22 @@ def test_every_standard_id_that_came_is_known_whoever_it_is_of():
     others = [CanFrame(0x7F0, bytes(8)), CanFrame(0x123, b"ab"), CanFrame(0x456, b"", remote=True)]
     frames = [*whole, *whole, *others, CanFrame(0x12345, bytes(8), extended=True), *half]
     expected = {frame.can_id for frame in (*whole, *others, *half)}
-    text, by_frame = SlcanScans(), ScanAssembler()
+    text = SlcanScans()
     text.feed(b"".join(map(encode_frame, frames)), 1)
-    for frame in frames:
-        by_frame.feed_frame(frame, 1)
-    assert text.can_ids == by_frame.can_ids == expected
-    assert text.counters()["foreign"] == by_frame.counters()["foreign"] == len(others) + 1
+    assert text.assembler.can_ids == expected and text.counters()["foreign"] == len(others) + 1
     for known in ([frames[:0], half], [half[:3], *[whole] * 5], [whole[10:], *[whole] * 5]):
         alone = SlcanScans()
         for number, piece in enumerate(known):
             alone.feed(b"".join(map(encode_frame, piece)), 10_000_000 * number)
-        assert alone.can_ids == {frame.can_id for piece in known for frame in piece}
+        assert alone.assembler.can_ids == {frame.can_id for piece in known for frame in piece}
 
 
 def test_the_head_of_a_line_with_a_later_tail_is_no_reading():
     """It came before the time of its stamp; one whose tail was only read late did not."""
-    places, ms = USPA44_MAP.wire_order("4"), 1_000_000
+    ms = 1_000_000
 
     def text(cycle):
-        frames = [CanFrame(can_id, bytes([cycle] * 8), timestamp_ms=10 * cycle) for can_id, _ in places]
-        return b"".join(map(encode_frame, frames))
+        return b"".join(cycle_lines(cycle, 10 * cycle))
 
     for lost, complete in ((False, True), (True, False)):
         scans = SlcanScans()
@@ -105,7 +101,8 @@ def test_any_chunking_gives_the_same_scans_and_counters(seed, sensors, stamped, 
         assert scans.counters()["frames"] == scans.counters()["readings"] + scans.counters()["foreign"]
         scans.begin_anew()  # frames that wait for the end of their cycle close none when the link breaks
     counts = whole.counters()
-    assert chunked.counters() == counts and chunked.can_ids == whole.can_ids and counts["scans"] == len(expected)
+    assert chunked.counters() == counts and counts["scans"] == len(expected)
+    assert chunked.assembler.can_ids == whole.assembler.can_ids
     assert faults or counts["scans"] == 8 * len(names)
     for name in names:
         mine, theirs = ([scan for scan in some if scan.sensor == name] for some in (got, expected))

@@ -19,7 +19,7 @@ import pytest
 from bridge_samples import write_recording
 from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT
-from xela_server_emulator import ServerEmulator, VendorServer
+from xela_server_emulator import ServerEmulator
 
 from edge.cli import main as cli
 from edge.inference.bundled import demo_recording, find_model
@@ -142,7 +142,7 @@ def emulated():
     with (
         Emulator([free], loop=True, frame_s=1e-6) as left,
         Emulator([free], loop=True, frame_s=1e-6) as right,
-        ServerEmulator(VendorServer([free], loop=True), message_hz=200) as server,
+        ServerEmulator([free], loop=True, message_hz=200) as server,
     ):
         yield left, right, server
 

@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from firmware_bridge.can.slcan import STAMPED_BYTES, CanFrame, SlcanDecoder
+from firmware_bridge.can.slcan import STAMPED_BYTES, CanFrame, SlcanDecoder, encode_frame
 from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.tracks import Recording, Track
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.scan import Scan
 
 REAL_RECORDINGS = Path(
@@ -35,6 +36,16 @@ def make_counts(scans: int, seed: int = 0) -> np.ndarray:
 def frames_of(scans: int, controller: int = 4, seed: int = 0) -> list[CanFrame]:
     """Return the frames of so many scans that all differ."""
     return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller)]
+
+
+def cycle_lines(number: int, stamp_ms: int | None = None) -> list[bytes]:
+    """Return the slcan lines of one scan; of stamped ones every eighth frame has the next millisecond."""
+    lines: list[bytes] = []
+    for place, (can_id, taxel) in enumerate(USPA44_MAP.wire_order("4")):
+        data = bytes([9, 1, number % 256, 2, number % 256, taxel, 3, 9])
+        stamped_ms = None if stamp_ms is None else (stamp_ms + place // 8) % 60_000
+        lines.append(encode_frame(CanFrame(can_id, data, timestamp_ms=stamped_ms)))
+    return lines
 
 
 def decoded(decoder: SlcanDecoder, data: bytes) -> list[CanFrame]:
@@ -118,10 +129,10 @@ class SilentDevice:
         self.port = os.ttyname(self.client_fd)
         return self
 
-    def received(self, count: int) -> bytes:
+    def received(self, count: int, within_s: float = 5) -> bytes:
         """Return the first bytes that came, and any that came with them."""
         data = b""
-        while len(data) < count and select.select([self.device_fd], [], [], 5)[0]:
+        while len(data) < count and select.select([self.device_fd], [], [], within_s)[0]:
             data += os.read(self.device_fd, 1000)
         return data
 

@@ -1,32 +1,128 @@
-"""USB with emulated gs_usb adapters, as a backend of pyusb that answers as libusb, errors included."""
+"""USB with emulated gs_usb adapters, as a backend of pyusb that answers as libusb, errors included.
+
+An adapter treats requests, frames and a client that dies as a candleLight does. Its queue holds 64 frames; a frame
+without room is lost, and a flag on the next frame reports it. It receives nothing without the right bit timing. A
+client's death does not stop it.
+"""
 
 # The documentation of pyusb explains each method. It is untyped, so pyright takes its empty methods to return None.
 # pyright: reportIncompatibleMethodOverride=false
 
 import errno
+import os
+import struct
+import threading
+import time
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any, Final
 
 import usb.backend
 import usb.core
-from gs_usb_adapter import GsUsbAdapter, StalledError
 
-IO, ACCESS, NO_DEVICE, NOT_FOUND, BUSY, TIMEOUT, OVERFLOW, PIPE = -1, -3, -4, -5, -6, -7, -8, -9
-_ERRNO: Final = {IO: errno.EIO, ACCESS: errno.EACCES, NO_DEVICE: errno.ENODEV, NOT_FOUND: errno.ENOENT} | {
-    BUSY: errno.EBUSY, TIMEOUT: errno.ETIMEDOUT, OVERFLOW: errno.EOVERFLOW, PIPE: errno.EPIPE
-}  # fmt: skip
+from firmware_bridge.can import gs_usb
+from firmware_bridge.can.gs_usb import BitTiming, BitTimingLimits
+from firmware_bridge.can.slcan import CanFrame
+
+QUEUE_FRAMES: Final = 64
+CANDLELIGHT: Final = BitTimingLimits(
+    features=0x13 | gs_usb.HARDWARE_STAMPS, clock_hz=48_000_000, tseg1_min=1, tseg1_max=16, tseg2_min=1, tseg2_max=8,
+    sjw_max=4, brp_min=1, brp_max=1024, brp_inc=1,
+)  # fmt: skip
+_FRAME: Final = struct.Struct("<IIBBBB8s")
+
+
+class GsUsbAdapter:
+    """Adapter from one plugging-in to the next. Its methods may be called from any thread."""
+
+    def __init__(self, limits: BitTimingLimits = CANDLELIGHT) -> None:
+        """Plug it in."""
+        self.started = False  # true while its channel is on the bus
+        self.right_bitrate = False  # true where its timing makes 1 Mbit/s
+        self.sent: list[CanFrame] = []  # frames that it put on the bus for the client
+        self.lost_frames = 0  # frames that had no room
+        self._limits = limits
+        self._stamped = False
+        self._overflowed = False
+        self.queue: deque[bytes] = deque()  # host frames that wait to be fetched
+        self._changed = threading.Condition()
+        self.plugged = True  # while its cable is in
+
+    def hear(self, *frames: CanFrame, stamp_us: int | None = None, channel: int = 0) -> None:
+        """Receive frames from the bus, at `stamp_us` of its clock, by default now."""
+        self._receive(frames, 0, stamp_us, channel)
+
+    def report(self, classes: int, data: bytes = bytes(8)) -> None:
+        """Send an error frame, of classes as in Linux's error.h."""
+        self._receive((CanFrame(classes, data),), gs_usb.ERROR, None, 0)
+
+    def unplug(self) -> None:
+        """Pull the cable out, and wake all who wait for it."""
+        with self._changed:
+            self.plugged = False
+            self._changed.notify_all()
+
+    def request_out(self, number: int, payload: bytes) -> None:
+        """Obey a request, or stall if it knows none such, or the payload is too short."""
+        lengths = {gs_usb.HOST_FORMAT: 4, gs_usb.BIT_TIMING: 20, gs_usb.MODE: 8}
+        if len(payload) < lengths.get(number, 1 << 16):
+            raise libusb_error(errno.EPIPE)
+        with self._changed:
+            if number == gs_usb.BIT_TIMING:
+                timing = BitTiming(*struct.unpack_from("<5I", payload))
+                self.right_bitrate = self._limits.clock_hz == timing.quanta * timing.brp * gs_usb.BITRATE_BIT_S
+            elif number == gs_usb.MODE:
+                wanted, features = struct.unpack_from("<II", payload)
+                self.started = wanted == 1
+                if self.started:
+                    self._stamped = features & self._limits.features & gs_usb.HARDWARE_STAMPS != 0
+
+    def request_in(self, number: int) -> bytes:
+        """Answer a request, or stall if it knows none such."""
+        if number != gs_usb.BIT_TIMING_LIMITS:
+            raise libusb_error(errno.EPIPE)
+        return struct.pack("<10I", *self._limits)
+
+    def take(self, data: bytes) -> None:
+        """Take a host frame to send, and echo it."""
+        with self._changed:
+            if self.started:
+                echo_id, raw_id, dlc, _, _, _, payload = _FRAME.unpack_from(data)
+                self.sent.append(CanFrame(raw_id, payload[:dlc]))
+                self._enqueue(echo_id, raw_id, dlc, 0, payload, None)
+
+    def fetch(self, timeout_s: float | None) -> bytes | None:
+        """Wait for the next host frame and return it; None when there is none in time, or the cable is out."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self.plugged or self.queue, timeout_s)
+            return self.queue.popleft() if self.plugged and self.queue else None
+
+    def _receive(self, frames: tuple[CanFrame, ...], flags: int, stamp_us: int | None, channel: int) -> None:
+        with self._changed:
+            for frame in frames:
+                if not (self.started and self.right_bitrate):
+                    return
+                if len(self.queue) >= QUEUE_FRAMES:
+                    self._overflowed = True
+                    self.lost_frames += 1
+                    continue
+                raw_id = frame.can_id | flags | gs_usb.EXTENDED * frame.extended | gs_usb.REMOTE * frame.remote
+                self._enqueue(gs_usb.RECEIVED, raw_id, len(frame.data), channel, frame.data, stamp_us)
+
+    def _enqueue(self, echo_id: int, raw_id: int, dlc: int, channel: int, payload: bytes, stamp_us: int | None) -> None:
+        flags = gs_usb.OVERFLOW_FLAG if self._overflowed and echo_id == gs_usb.RECEIVED else 0
+        self._overflowed = self._overflowed and not flags
+        data = _FRAME.pack(echo_id, raw_id, dlc, channel, flags, 0, payload)
+        if self._stamped:
+            data += struct.pack("<I", (time.monotonic_ns() // 1000 if stamp_us is None else stamp_us) & 0xFFFFFFFF)
+        self.queue.append(data)
+        self._changed.notify_all()
 
 
 class GsUsbPort:
-    """Place on the bus where an adapter may be plugged in: the one that is there, or was there last.
-
-    Attributes:
-        kernel_driver, claimed: who holds it; handles: how often it is open; permitted: the user may open it.
-        sockets: numbers of the hubs' sockets that lead to it.
-        gone_as: the error of libusb that unplugging gives; host controllers differ.
-    """
+    """Place on the bus where an adapter may be plugged in: the one that is there, or was there last."""
 
     def __init__(
         self,
@@ -41,15 +137,14 @@ class GsUsbPort:
         """Plug an adapter in; `adapter` makes a new one each time."""
         self.serial_number = serial_number
         self.product = product
-        self.kernel_driver = False
-        self.claimed = False
-        self.handles = 0
-        self.permitted = True
-        self.gone_as = NO_DEVICE
+        self.kernel_driver = self.claimed = False  # who holds it
+        self.handles = 0  # how often it is open
+        self.permitted = True  # the user may open it
+        self.gone_as = errno.ENODEV  # the error of libusb that unplugging gives; host controllers differ
         self.usb_id = usb_id
         self.packet_bytes = packet_bytes
         self.address = 5
-        self.sockets = sockets
+        self.sockets = sockets  # numbers of the hubs' sockets that lead to it
         self._make = adapter
         self.adapter = adapter()
 
@@ -123,7 +218,7 @@ class GsUsbBackend(usb.backend.IBackend):
     def open_device(self, dev: _Plugged) -> _Plugged:
         dev.check()
         if not dev.port.permitted:
-            raise libusb_error(ACCESS)
+            raise libusb_error(errno.EACCES)
         dev.port.handles += 1
         return dev
 
@@ -138,7 +233,7 @@ class GsUsbBackend(usb.backend.IBackend):
     def claim_interface(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if dev_handle.port.kernel_driver or (dev_handle.port.claimed and not dev_handle.claimed_here):
-            raise libusb_error(BUSY)
+            raise libusb_error(errno.EBUSY)
         dev_handle.port.claimed = dev_handle.claimed_here = True
 
     def release_interface(self, dev_handle: _Plugged, intf: int) -> None:
@@ -152,13 +247,13 @@ class GsUsbBackend(usb.backend.IBackend):
     def detach_kernel_driver(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if not dev_handle.port.kernel_driver:
-            raise libusb_error(NOT_FOUND)
+            raise libusb_error(errno.ENOENT)
         dev_handle.port.kernel_driver = False
 
     def attach_kernel_driver(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if dev_handle.port.claimed:
-            raise libusb_error(BUSY)
+            raise libusb_error(errno.EBUSY)
         dev_handle.port.kernel_driver = True
 
     # Transfers.
@@ -174,16 +269,13 @@ class GsUsbBackend(usb.backend.IBackend):
         timeout: int,
     ) -> int:
         adapter = dev_handle.check()
-        try:
-            if not bmRequestType & 0x80:  # to the device
-                adapter.request_out(bRequest, data.tobytes())
-                return len(data)
-            if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):  # get a descriptor, of a text
-                answer = self._text(dev_handle.port, wValue & 0xFF)
-            else:
-                answer = adapter.request_in(bRequest)
-        except StalledError as error:
-            raise libusb_error(PIPE) from error
+        if not bmRequestType & 0x80:  # to the device
+            adapter.request_out(bRequest, data.tobytes())
+            return len(data)
+        if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):  # get a descriptor, of a text
+            answer = self._text(dev_handle.port, wValue & 0xFF)
+        else:
+            answer = adapter.request_in(bRequest)
         answer = answer[: len(data)]
         data[: len(answer)] = array("B", answer)
         return len(answer)
@@ -194,9 +286,9 @@ class GsUsbBackend(usb.backend.IBackend):
         data = adapter.fetch(timeout / 1000 if timeout else None)
         if data is None:
             dev_handle.check()  # the cable may have come out meanwhile
-            raise libusb_error(TIMEOUT)
+            raise libusb_error(errno.ETIMEDOUT)
         if len(data) > len(buff):
-            raise libusb_error(OVERFLOW)
+            raise libusb_error(errno.EOVERFLOW)
         buff[: len(data)] = array("B", data)
         return len(data)
 
@@ -208,7 +300,7 @@ class GsUsbBackend(usb.backend.IBackend):
 
     def _check_claim(self, handle: _Plugged) -> None:
         if not handle.claimed_here:
-            raise libusb_error(IO)
+            raise libusb_error(errno.EIO)
 
     def _let_go(self, handle: _Plugged) -> None:
         if handle.claimed_here:
@@ -219,12 +311,12 @@ class GsUsbBackend(usb.backend.IBackend):
             return b"\x04\x03\x09\x04"  # English
         text = {2: port.product, 3: port.serial_number}.get(index)
         if text is None:
-            raise StalledError(f"text {index}")
+            raise libusb_error(errno.EPIPE)
         encoded = text.encode("utf-16-le")
         return bytes((2 + len(encoded), 3)) + encoded
 
 
-def libusb_error(code: int) -> usb.core.USBError:
-    """Return the error that pyusb makes of one of libusb."""
-    kind = usb.core.USBTimeoutError if code == TIMEOUT else usb.core.USBError
-    return kind(f"libusb error {code}", code, _ERRNO[code])
+def libusb_error(number: int) -> usb.core.USBError:
+    """Return the error that pyusb makes of one of libusb, by its errno."""
+    kind = usb.core.USBTimeoutError if number == errno.ETIMEDOUT else usb.core.USBError
+    return kind(os.strerror(number), None, number)

@@ -11,7 +11,7 @@ import can
 from bridge_samples import decoded, frames_of, make_counts, read_scans, wait_for, write_recording
 from can.interfaces.virtual import VirtualBus
 from gs_usb_emulator import GsUsbBackend, GsUsbPort
-from xela_server_emulator import ServerEmulator, looping
+from xela_server_emulator import looping
 
 from firmware_bridge.can.slcan import CanFrame, SlcanDecoder, encode_frame
 from firmware_bridge.emulation.pty_port import PseudoPort, listen
@@ -34,26 +34,20 @@ FRAME_US = 130
 
 
 class Rig:
-    """A device and links to it.
+    """A device and links to it."""
 
-    Attributes:
-        name, kind, sensor: what a link to it and its scans say.
-        lost: words of the error once it was pulled out; away: of opening a link to it then.
-        decoder: class whose counters the link passes on.
-    """
-
-    name: str
+    name: str  # what a link to it says, as are `kind`, and `sensor` in its scans
     kind = "emulated"
     sensor = "4"
-    lost = away = ""
-    decoder: type
+    lost = away = ""  # words of the error once it was pulled out, and of opening a link to it then
+    decoder: type  # whose counters the link passes on
 
     def link(self, prefix: str = "", **settings) -> Link:
         """Return a link, the names of whose sensors begin so."""
-        if issubclass(type(self), CanRig) and prefix:
-            settings["model"] = placed_map(USPA44_MAP, {}, prefix)
-        elif prefix:
-            settings["prefix"] = prefix
+        if prefix:
+            settings |= (
+                {"model": placed_map(USPA44_MAP, {}, prefix)} if isinstance(self, CanRig) else {"prefix": prefix}
+            )
         link = self.make(**settings)
         link.prefix = prefix
         return link
@@ -215,10 +209,7 @@ class PythonCanRig(CanRig):
         self._far = VirtualBus(channel=self._channel, preserve_timestamps=True)
         self._plugged = threading.Event()
         self._plugged.set()
-        monkeypatch.setattr(can, "Bus", self._open)
-
-    def _open(self, *, channel, **_):
-        return PulledBus(self._plugged, channel=channel)
+        monkeypatch.setattr(can, "Bus", lambda *, channel, **_: PulledBus(self._plugged, channel=channel))
 
     def make(self, **settings):
         return CanBusLink("virtual", self._channel, **settings)
@@ -266,7 +257,7 @@ class ServerRig(Rig):
     decoder = ServerScans
 
     def __init__(self, folder, monkeypatch) -> None:
-        self._server = ServerEmulator(looping())
+        self._server = looping()
         self._server.__enter__()
         self.name = f"xela-server:{self._server.url}"
         self.lose, self.put_back = self._server.kill, self._server.start_again

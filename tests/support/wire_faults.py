@@ -129,27 +129,16 @@ def losing_bytes(lines: Sequence[tuple[float, bytes]], sensors: int, draw: rando
 
 @dataclass
 class Found:
-    """What became of the scans.
+    """What became of the scans."""
 
-    Attributes:
-        numbers: cycles of the whole scans, by sensor.
-        torn: scans without all sixteen readings.
-        mixed: whole ones with readings of two cycles.
-        missed: cycles of which every byte was handed on, and no whole scan was returned.
-        late: scans whose reading is called old, though it was on the bus less than 50 ms before.
-        lag_ms: longest time from bus to `device_ns`, beyond which none of them may be.
-        wait_ns: longest time from the arrival of a scan's newest reading until it was returned.
-        counters: those of the link.
-    """
-
-    numbers: dict[str, list[int]] = field(default_factory=dict)
-    torn: int = 0
-    mixed: int = 0
-    missed: int = 0
-    late: int = 0
-    lag_ms: float = 0.0
-    wait_ns: int = 0
-    counters: dict[str, int] = field(default_factory=dict)
+    numbers: dict[str, list[int]] = field(default_factory=dict)  # cycles of the whole scans, by sensor
+    torn: int = 0  # scans without all sixteen readings
+    mixed: int = 0  # whole ones with readings of two cycles
+    missed: int = 0  # cycles of which every byte was handed on, and no whole scan was returned
+    late: int = 0  # scans whose reading is called old, though it was on the bus less than 50 ms before
+    lag_ms: float = 0.0  # longest time from bus to `device_ns`, beyond which none of them may be
+    wait_ns: int = 0  # longest time from the arrival of a scan's newest reading until it was returned
+    counters: dict[str, int] = field(default_factory=dict)  # those of the link
 
     @property
     def whole(self) -> int:

@@ -1,26 +1,24 @@
 """Emulator of the vendor's xela_server on this machine, with sensors that play recordings.
 
-It is as strict as the real one: it sends its readings at its own pace, old or new, queues messages for a slow client
-until they are old, and restarts its count after a restart. Messages made by hand are here as well.
+It is as strict as the real one: it sends its readings at its own pace, old or new, and restarts its count after a
+restart. Messages made by hand are here as well.
 """
 
-import asyncio
 import json
 import logging
 import math
-import socket
-import struct
 import threading
 import time
-from collections.abc import Coroutine, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Final, Self
 
 import numpy as np
 import pytest
 from bridge_samples import REST_COUNTS, make_recording, wait_for
-from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request
+from websockets.sync.server import ServerConnection, serve
 
 from firmware_bridge.emulation.slcan_emulator import playing_rate_hz
 from firmware_bridge.errors import LinkLostError
@@ -31,27 +29,88 @@ UNIX_S: Final = 1_768_365_606.25
 MS: Final = 1_000_000
 
 
-class VendorServer:
-    """Model of a server with sensors that play recordings: its message at any time."""
+HOST: Final = "127.0.0.1"  # this machine alone, so that no other one takes its messages for a sensor's
+_QUIET: Final = logging.getLogger("xela_server_emulator")
+_QUIET.addHandler(logging.NullHandler())
+_QUIET.propagate = False
+
+
+class ServerEmulator:
+    """Server of messages on sensors that play recordings, to each client from its greeting on; hangs up at the end."""
 
     def __init__(
-        self, recordings: Sequence[Recording], *, loop: bool = False, others: Sequence[tuple[str, int]] = ()
+        self,
+        recordings: Sequence[Recording],
+        *,
+        loop: bool = False,
+        others: Sequence[tuple[str, int]] = (),
+        message_hz: float = 100.0,
     ) -> None:
-        """Prepare to play each track as a sensor, over and over where it is to loop.
+        """Prepare to play each track as a sensor, over and over where it is to loop, in so many messages a second.
 
         `others` are model and number of taxels of sensors other than 4x4 ones, after all the others.
         """
-        self._loop = loop
+        self.url = ""  # ws://HOST:PORT, once entered
+        self._loop, self._message_hz = loop, message_hz
         self._others = [sensor_entry(model=model, taxels=taxels) for model, taxels in others]
         self._sensors = [
             (track.counts, playing_rate_hz(recording, track, None))
             for recording in recordings
             for track in recording.tracks
         ]
+        self._port = 0
+        self.clients: set[ServerConnection] = set()  # that are connected
+        self._answers = threading.Event()
+        self._answers.set()
 
-    def ended(self, elapsed_s: float) -> bool:
-        """Return True once every cycle of every sensor could be sent."""
-        return not self._loop and all(elapsed_s * rate_hz >= len(counts) for counts, rate_hz in self._sensors)
+    def __enter__(self) -> Self:
+        self.start_again()
+        self.url = f"ws://{HOST}:{self._port}"
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.thaw()
+        self.kill()
+
+    def kill(self) -> None:
+        """End as a killed process does: connections break, and the port is closed."""
+        self._server.shutdown()
+        self._thread.join()
+        for client in list(self.clients):
+            client.close_socket()
+        wait_for(lambda: not self.clients)
+
+    def start_again(self) -> None:
+        """Listen again after `kill`, on the same port; messages are counted from 0."""
+
+        def hold(client: ServerConnection, request: Request) -> None:
+            self._answers.wait()
+
+        settings: dict[str, Any] = {"compression": None, "logger": _QUIET, "process_request": hold}
+        self._server = serve(self._attend, HOST, self._port, **settings)
+        self._port = self._server.socket.getsockname()[1]
+        self._thread = threading.Thread(target=self._server.serve_forever)
+        self._thread.start()
+
+    def freeze(self) -> None:
+        """Stop sending and answering, with every connection open, as when it hangs or the network is gone."""
+        self._answers.clear()
+
+    def thaw(self) -> None:
+        """Go on after `freeze`; the messages of the time between are never sent."""
+        self._answers.set()
+
+    def say(self, text: str | bytes) -> None:
+        """Send any text or bytes to every client; bytes as a binary message."""
+        wait_for(lambda: self.clients)
+        for client in list(self.clients):
+            client.send(text)
+
+    def close_all(self, code: int, reason: str) -> None:
+        """Close every connection politely, and go on listening."""
+        for client in list(self.clients):
+            client.close(code, reason)
+        wait_for(lambda: not self.clients)
 
     def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
         """Return the message on all sensors at a time in [s] from its start, `unix_s` [s] on its own clock."""
@@ -63,128 +122,20 @@ class VendorServer:
             entries.append(sensor_entry(counts, ups=float(rate_hz), time_s=unix_s - elapsed_s % (1 / rate_hz)))
         return message(sequence, *entries, *self._others, time_s=unix_s)
 
-
-HOST: Final = "127.0.0.1"  # this machine alone, so that no other one takes its messages for a sensor's
-_QUIET: Final = logging.getLogger("xela_server_emulator")
-_QUIET.addHandler(logging.NullHandler())
-_QUIET.propagate = False
-
-
-class ServerEmulator:
-    """Server of a VendorServer's messages, from the greeting of the first client; hangs up at the end.
-
-    Every fault can be requested from any thread, and has happened when the call returns.
-
-    Attributes:
-        url: ws://HOST:PORT, once entered.
-        lost_messages: number of messages without room at a client.
-    """
-
-    def __init__(self, server: VendorServer, *, message_hz: float = 100.0) -> None:
-        """Prepare to serve so many messages a second."""
-        self.url = ""
-        self.lost_messages = 0
-        self._vendor, self._message_hz = server, message_hz
-        self._port = 0
-        self._sequence = 0
-        self._greeted = asyncio.Event()
-        self._clients: set[ServerConnection] = set()
-        self._thawed = threading.Event()
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="server-emulator", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        self.start_again()
-        self.url = f"ws://{HOST}:{self._port}"
-        self._playing = asyncio.run_coroutine_threadsafe(self._play(), self._loop)
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.thaw()
-        self._playing.cancel()
-        self.kill()
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
-
-    def kill(self) -> None:
-        """End as a killed process does: connections break, and the port is closed."""
-        self._ask(self._die())
-
-    def start_again(self) -> None:
-        """Listen again after `kill`, on the same port; messages are counted from 0."""
-        self._ask(self._listen())
-
-    def freeze(self) -> None:
-        """Stop sending and answering, with every connection open, as when it hangs or the network is gone."""
-        frozen = threading.Event()
-        self._thawed.clear()
-        self._loop.call_soon_threadsafe(lambda: (frozen.set(), self._thawed.wait()))
-        frozen.wait()
-
-    def thaw(self) -> None:
-        """Go on after `freeze`; the messages of the time between are never sent."""
-        self._thawed.set()
-
-    def say(self, text: str | bytes) -> None:
-        """Send any text or bytes to every client; bytes as a binary message."""
-        self._ask(self._send(text))
-
-    def close_all(self, code: int, reason: str) -> None:
-        """Close every connection politely, and go on listening."""
-        self._ask(self._close(code, reason))
-
-    def _ask(self, action: Coroutine[Any, Any, object]) -> None:
-        asyncio.run_coroutine_threadsafe(action, self._loop).result()
-
-    async def _listen(self) -> None:
-        self._sequence = 0
-        settings = {"compression": None, "ping_interval": None, "logger": _QUIET}
-        self._server = await serve(self._attend, HOST, self._port, **settings)
-        self._port = next(iter(self._server.sockets)).getsockname()[1]
-
-    async def _attend(self, client: ServerConnection) -> None:
-        """Greet a client, and drop what it sends."""
-        with suppress(ConnectionClosed):
-            await client.send(json.dumps({"message": WELCOME, "time": time.time(), "version": "1.8.0b_208601"}))
-            self._clients.add(client)
-            self._greeted.set()
-            async for _ in client:
-                pass
-        self._clients.discard(client)
-
-    async def _send(self, text: str | bytes) -> None:
-        for client in list(self._clients):
-            if client.transport.get_write_buffer_size() > 1 << 20:  # unread bytes
-                self.lost_messages += 1
-            else:
-                broadcast([client], text)
-
-    async def _close(self, code: int, reason: str) -> None:
-        await asyncio.gather(*(client.close(code, reason) for client in list(self._clients)))
-
-    async def _die(self) -> None:
-        self._server.close(close_connections=False)
-        for client in list(self._clients):
-            with suppress(OSError):  # the client may have gone just now
-                # As the kernel does for a process that was killed, it resets the connection.
-                reset = struct.pack("ii", 1, 0)
-                client.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, reset)
-            client.transport.abort()
-        await self._server.wait_closed()
-
-    async def _play(self) -> None:
-        """Send messages from the first greeting to the end of the recordings, then hang up."""
-        await self._greeted.wait()
+    def _attend(self, client: ServerConnection) -> None:
+        """Greet a client, and send messages to the end of the recordings."""
         start_s, ticks = time.monotonic(), 0
-        while not self._vendor.ended(ticks / self._message_hz):
-            await asyncio.sleep(max(0.0, start_s + ticks / self._message_hz - time.monotonic()))
-            await self._send(self._vendor.message(self._sequence, ticks / self._message_hz, time.time()))
-            self._sequence += 1
-            behind = math.floor((time.monotonic() - start_s) * self._message_hz) - ticks
-            ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
-        await self._close(1001, "")
+        played_s = math.inf if self._loop else max(len(counts) / rate_hz for counts, rate_hz in self._sensors)
+        with suppress(ConnectionClosed):
+            client.send(json.dumps({"message": WELCOME, "time": time.time(), "version": "1.8.0b_208601"}))
+            self.clients.add(client)
+            while ticks / self._message_hz < played_s:
+                time.sleep(max(0.0, start_s + ticks / self._message_hz - time.monotonic()))
+                self._answers.wait()
+                client.send(self.message(ticks, ticks / self._message_hz, time.time()))
+                behind = math.floor((time.monotonic() - start_s) * self._message_hz) - ticks
+                ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
+        self.clients.discard(client)
 
 
 def sensor_entry(counts: np.ndarray = REST_COUNTS, *, ups=100.0, time_s=UNIX_S, **changes) -> dict:
@@ -211,8 +162,8 @@ def message(sequence: object, *entries: dict, time_s: object = UNIX_S, **more) -
     return json.dumps({"message": sequence, "time": time_s, "version": "1.8.0b_208601", **sensors, **more})
 
 
-def looping(**options) -> VendorServer:
-    return VendorServer([make_recording(50)], loop=True, **options)
+def looping(**options) -> ServerEmulator:
+    return ServerEmulator([make_recording(50)], loop=True, **options)
 
 
 def lose(link):
