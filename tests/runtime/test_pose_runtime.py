@@ -70,6 +70,15 @@ class TestChoice:
             scan = replace(pad.scan(PRESS, time_ns=11 * PERIOD_NS), device_ns=device_ns)
             assert pad.runtime.push(scan).pose.x_mm == x_mm
 
+    def test_an_earlier_tap_has_the_pose_of_when_it_was_on_the_bus(self):
+        pad = make_pad()
+        for number in range(20):
+            pad.runtime.pose(PadPose(number, 0), number * PERIOD_NS)
+        for time, on_bus, press in ((6, 5, PRESS), (10, 7, 2 * PRESS), (11, 10, 0), (13, 12, PRESS)):
+            scan = replace(pad.scan(press, time_ns=time * PERIOD_NS), device_ns=on_bus * PERIOD_NS)
+            result = pad.runtime.push(scan)
+        assert result.pose.x_mm == 12 and result.poses[:, 0].tolist() == [0, 7 - 12]
+
     def test_a_scan_without_a_pose_is_used_alone_with_one_event_each(self):
         pad = make_pad()
         pad.tap()
