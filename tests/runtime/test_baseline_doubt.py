@@ -100,6 +100,8 @@ FIELD[2] = 300 * (1 + 0.2 * COL)
         # A local press needs no rest before it, not even where it begins a grip, but for an old baseline.
         (BASELINE, [(LOCAL, HELD)], None),
         (BASELINE, [(CORNER, HELD), (GRIP, HELD)], None),
+        # Nor does drift explain one that is loosened, as it does a grip.
+        (BASELINE, [(0.0, FREE), (CORNER, HELD), (CORNER * 0.3, HELD)], None),
         (BASELINE, [(LOCAL + drift_field(0, 4), DOUBT)], ""),
         # All taxels alike at once are a field and no touch.
         (BASELINE, [(0.0, FREE), (FIELD, DOUBT), (0.0, FREE)], "alike"),
