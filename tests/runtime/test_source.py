@@ -253,7 +253,7 @@ class TestRecords:
             counted = [counters["scans"] for counters in sink.counters]
             assert counted == [1, 3, 3] if patient else all(counted[n] >= at for n, at in enumerate((1, 3, 3)))
 
-    @pytest.mark.parametrize("kind", ["lost", "back", "trouble"])
+    @pytest.mark.parametrize("kind", ["lost", "silent", "back", "trouble"])
     def test_a_notice_reaches_runtime_and_sinks_in_its_place(self, kind):
         order, runtime = [], make_runtime()
         runtime.lose_touch = lambda sensors, **_: order.append("lost touch")
