@@ -10,7 +10,7 @@ import pytest
 from map_samples import dome, letter, pixels_mm, raster, result_of
 
 from edge.api import Event, PadPose, SinkError, UsageError
-from edge.mapping.object_map import STEP_MM, MapLayers, ObjectMap
+from edge.mapping.object_map import STEP_MM, Footprint, MapLayers, ObjectMap
 from edge.mapping.sink import SHOW_NS, MapSink
 
 HERE = PadPose(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -139,6 +139,12 @@ def test_what_lies_outside_the_map_is_left_out():
         whole.add(result_of(dome, HERE), PadPose(x_mm, 0.0))
     whole.finish()
     assert (whole.counts["outside"], whole.fused) == (2, 1) and whole.layers().coverage[40, 0] == 1
+
+
+def test_a_pattern_is_read_between_its_rows_and_columns():
+    layer = (np.arange(4)[:, None] + 10 * np.arange(5)).astype(np.float32)[..., None]
+    read = Footprint(np.arange(3), np.array([1.25, 0.0, 3.9]), np.array([0.75, 9.0, 2.0])).read(layer)
+    assert read[:, 0] == pytest.approx([8.75, 40, 23]), "beyond the outermost, theirs"
 
 
 def test_a_size_out_of_range_and_another_unit_are_refused():
