@@ -201,7 +201,7 @@ class TestChecks:
     def test_a_posed_tap_that_does_not_belong_goes_alone(self):
         model = PosedModel(make_checked_contract(make_posed_trust(2.5)))
         pad = Pushed(make_runtime(model))
-        for x_mm, more in ((1, 0), (4, 100), (2, 200)):
+        for x_mm, more in ((1, 0), (2.55, 100), (2, 200)):  # 0.73 in the middle
             pad.tap(PadPose(x_mm, 0), PRESS + more)
         pad.place(PadPose(0, 0))
         light, again = pad.push(0.7 * PRESS), pad.push(0.7 * PRESS)
