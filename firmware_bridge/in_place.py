@@ -24,9 +24,14 @@ def write_in_place(
     check_writable(path)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         draft = Path(folder) / path.name
-        write(draft)
-        with draft.open("rb") as file:
-            os.fsync(file.fileno())  # otherwise a power cut could leave an empty file under the name
+        try:
+            write(draft)
+            with draft.open("rb") as file:
+                os.fsync(file.fileno())  # otherwise a power cut could leave an empty file under the name
+        except OSError as error:
+            if error.errno is not None and error.filename is None:  # as of a full disk
+                error.filename = str(path)
+            raise
         load(draft)
         if keep_before and path.exists():
             before = Path(folder) / (path.name + BACKUP_SUFFIX)

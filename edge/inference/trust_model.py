@@ -108,7 +108,8 @@ class ForwardModel:
     ) -> float:
         """Return the share of the energy of a tap's readings that its pattern leaves unexplained.
 
-        Readings count less where noise, drift, the operator, and what remains of the gains make them uncertain.
+        Readings (3, rows, cols) in network units count less where noise, drift, the operator, and what remains of the
+        gains make them uncertain. The pattern (H, W) is in [mm], the traction (3, h, w) in [kPa].
         """
         readings, z = tap.reshape(-1), tap[2].reshape(-1)
         energy = readings * readings

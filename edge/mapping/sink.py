@@ -152,7 +152,7 @@ class MapSink(Sink):
         try:
             write_in_place(path, partial(save_npz, whole=self.whole, **self._facts), check_npz)
         except (OSError, ValueError, KeyError) as error:
-            raise SinkError(f"cannot write {path}: {error}") from error
+            raise SinkError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from error
         self._written.append(path)
 
     def _show(self) -> None:

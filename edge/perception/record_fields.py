@@ -43,7 +43,8 @@ class Kind:
     packed: str = ""  # struct's character, in shared memory
     message: str = ""  # in ROS
     unknown: Any = None  # value for "unknown" in outputs without null; None where the value is always available
-    words: tuple[str, ...] = ()  # of a choice; numbered in shared memory, from 1, since 0 is memory that nobody wrote
+    # Of a choice, numbered in shared memory from 1, since 0 is memory that nobody wrote: their order is the format's.
+    words: tuple[str, ...] = ()
     shape: str = ""  # of an array: "scan", "pattern", "deviation", "traction" or "poses", a row for each tap
 
 

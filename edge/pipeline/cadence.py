@@ -85,7 +85,7 @@ class Cadence:
         first = self._paced_from or scan
         scans = scan.number - first.number
         mean_ns = (scan.on_bus_ns - first.on_bus_ns) / scans if scans else 0.0
-        return mean_ns if scans >= 32 else max(period_ns, mean_ns)  # by a median 1 % off, a stall swallows a scan
+        return mean_ns if scans >= 32 else max(period_ns, mean_ns)  # a median 1 % off misses a scan in each second
 
 
 class ReadingPace(NamedTuple):

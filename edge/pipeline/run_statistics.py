@@ -172,6 +172,7 @@ _ADVICE: Final = {
     "bad_json": "messages are no JSON with a number: another server answers at this address",
     "frames": "frames are lost, or this is another kind of pad (--id-map)?",
     "error_frames": "is the bus at 1 Mbit/s?",
+    "fd_frames": "another device, of CAN FD, is on this bus: is it the sensor's?",
     "skipped_bytes": "another device, or another line speed (@BAUD after the port)? See edge-sr devices, and",
 }
 """What may be wrong, by the counter of what came; the doctor does not show those of a server."""

@@ -43,7 +43,7 @@ def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) ->
 
 
 def links_to(texts: Sequence[str], sensor_file: SensorFile, rate_hz: float | None) -> tuple[list[Link], SensorFile]:
-    """Return the links to the requested sources, else to the only adapter, not yet entered, and sensors' settings."""
+    """Return links, not yet entered, to the sources, else the file's adapter or the only one, and sensors' settings."""
     if rate_hz is not None:
         check_positive("rate_hz", rate_hz)
     for text in texts:

@@ -268,8 +268,9 @@ def full(draft: Path) -> None:
 )
 def test_what_cannot_be_written_or_read_back_leaves_the_former(tmp_path, write, load, error):
     written(tmp_path / "a.json", "good")
-    with pytest.raises(error):
+    with pytest.raises(error) as refused:
         write_in_place(tmp_path / "a.json", write, load)
+    assert write is not full or refused.value.filename == str(tmp_path / "a.json"), "a message can name it"
     assert (tmp_path / "a.json").read_text() == "good" and listing(tmp_path) == ["a.json"]
 
 

@@ -188,6 +188,7 @@ def test_the_command_writes_integers_and_says_what_they_cost(tmp_path, limits, c
     assert line.startswith("one-int8.onnx: ") and "dB lost" in line
     contract = ModelSession(path := tmp_path / "one-int8.onnx").contract
     assert contract.arithmetic == "int8" and set(contract.test_error) == {"1"} == set(contract.confidence)
+    assert contract.test_set_sha256 != load_frozen_set(BUNDLE_DIR / "frozen.npz").sha256(), "it is of --test"
     path.write_bytes(b"better")
     with pytest.raises(SystemExit, match=r"one-int8\.onnx \(more than .* dB; the file that was there stays\)"):
         main(words)

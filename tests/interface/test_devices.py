@@ -124,6 +124,7 @@ def counted(said):
             "only received_bytes 240 came: is the sensor powered .*edge-sr doctor",
         ),
         ({"frames": 0, "error_frames": 7}, "only error_frames 7 came: .* 1 Mbit/s"),
+        ({"frames": 0, "error_frames": 0, "fd_frames": 7}, "only fd_frames 7 came: another device, of CAN FD"),
     ],
 )
 def test_what_came_goes_before_advice(counters, words):

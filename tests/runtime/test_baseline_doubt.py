@@ -25,6 +25,8 @@ GRIP[2] = 700 + 300 * ROW + 60 * COL
 GRIP[0] = -180 + 60 * ROW
 LOCAL = np.zeros((3, 4, 4))
 LOCAL[2, 1, 1:3] = 1500
+CORNER = np.zeros((3, 4, 4))
+CORNER[2, :2, :3] = 700  # six taxels: fewer rest than show that the pad was free
 PADS = np.clip(np.random.default_rng(3).normal(1, 0.25, (4, 4)), 0.5, 1.5)
 WARM = np.zeros((3, 4, 4))
 WARM[2] = 120 * PADS
@@ -95,8 +97,11 @@ FIELD[2] = 300 * (1 + 0.2 * COL)
         # A recording that begins gripped is one with its own baseline alone.
         (TAKEN, [(GRIP, HELD)], None),
         (BASELINE, [(GRIP, DOUBT), (0.0, FREE), (GRIP, HELD)], ""),
-        # A local press needs no rest before it, but for an old baseline.
+        # A local press needs no rest before it, not even where it begins a grip, but for an old baseline.
         (BASELINE, [(LOCAL, HELD)], None),
+        (BASELINE, [(CORNER, HELD), (GRIP, HELD)], None),
+        # Nor does drift explain one that is loosened, as it does a grip.
+        (BASELINE, [(0.0, FREE), (CORNER, HELD), (CORNER * 0.3, HELD)], None),
         (BASELINE, [(LOCAL + drift_field(0, 4), DOUBT)], ""),
         # All taxels alike at once are a field and no touch.
         (BASELINE, [(0.0, FREE), (FIELD, DOUBT), (0.0, FREE)], "alike"),

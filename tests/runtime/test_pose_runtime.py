@@ -70,6 +70,15 @@ class TestChoice:
             scan = replace(pad.scan(PRESS, time_ns=11 * PERIOD_NS), device_ns=device_ns)
             assert pad.runtime.push(scan).pose.x_mm == x_mm
 
+    def test_an_earlier_tap_has_the_pose_of_when_it_was_on_the_bus(self):
+        pad = make_pad()
+        for number in range(20):
+            pad.runtime.pose(PadPose(number, 0), number * PERIOD_NS)
+        for time, on_bus, press in ((6, 5, PRESS), (10, 7, 2 * PRESS), (11, 10, 0), (13, 12, PRESS)):
+            scan = replace(pad.scan(press, time_ns=time * PERIOD_NS), device_ns=on_bus * PERIOD_NS)
+            result = pad.runtime.push(scan)
+        assert result.pose.x_mm == 12 and result.poses[:, 0].tolist() == [0, 7 - 12]
+
     def test_a_scan_without_a_pose_is_used_alone_with_one_event_each(self):
         pad = make_pad()
         pad.tap()
@@ -192,7 +201,7 @@ class TestChecks:
     def test_a_posed_tap_that_does_not_belong_goes_alone(self):
         model = PosedModel(make_checked_contract(make_posed_trust(2.5)))
         pad = Pushed(make_runtime(model))
-        for x_mm, more in ((1, 0), (4, 100), (2, 200)):
+        for x_mm, more in ((1, 0), (2.55, 100), (2, 200)):  # 0.73 in the middle
             pad.tap(PadPose(x_mm, 0), PRESS + more)
         pad.place(PadPose(0, 0))
         light, again = pad.push(0.7 * PRESS), pad.push(0.7 * PRESS)

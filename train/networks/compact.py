@@ -24,7 +24,7 @@ from train.networks.blocks import Objective, PatternNet, Residual, relative_rms_
 from train.networks.symmetric import Group, SymmetricConv2d, fields, scalars, vectors
 
 _HIDDEN: Final = 32
-_MOST_INPUT: Final = 4.0  # bound of an input in standard deviations over the training presses
+_MOST_INPUT: Final = 4.0  # standard deviations over the training presses: beyond them nothing is extrapolated
 LOG_RANGE: Final = (-1.5, 2.5)  # of a factor: a window unlike all others widens its intervals twelvefold at most
 _MASKS: Final = 3
 # Masks that hold a region, in the order of REGIONS, and 1 for all pixels.

@@ -149,7 +149,11 @@ class _Waves(NamedTuple):
 
 
 def _waves(layer: Layer, q: Array, z_mm: float) -> _Waves:
-    """Return the solutions (a + b q z) exp(+-q z) of Navier's equations, scaled to similar amplitudes."""
+    """Return the solutions (a + b q z) exp(+-q z) of Navier's equations, scaled to similar amplitudes.
+
+    For u = (a + b q z) exp(q z) equilibrium requires w = (a - b (3-4nu) + b q z) exp(q z); for u = (a + b q z) exp(-q
+    z), it requires w = (-a - b (3-4nu) - b q z) exp(-q z).
+    """
     kappa = 3 - 4 * layer.poisson
     above, below = q * (z_mm - layer.thickness_mm), q * z_mm
     rising, falling = np.exp(above), np.exp(-q * z_mm)

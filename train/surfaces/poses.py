@@ -1,7 +1,8 @@
 """Poses of the taps on a surface: the paper's schedule, poses drawn at random, and schedules of further taps.
 
 A schedule says where the pad was in earlier taps, in the newest one's axes, newest tap first: x, y in [mm] and a turn
-in [deg], as in `firmware_bridge.poses`.
+in [deg], as in `firmware_bridge.poses`. A target is a tap whose pattern is reconstructed; those before it are at the
+same place, each turned back by one more angle step.
 """
 
 from collections.abc import Callable, Mapping
