@@ -186,5 +186,8 @@ def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int
     came = ", ".join(f"{name} {count}" for name, count in arrived.items())
     if arrived.get("skipped_bytes", 0) <= MOST_STRAY_BYTES:
         arrived.pop("skipped_bytes", None)
-    why = next((text for name, text in _ADVICE.items() if name in arrived), "is the sensor powered and its cable in?")
+    seen = [name for name in _ADVICE if name in arrived]
+    if "messages" in arrived:  # of which a few may be of any kind
+        seen.sort(key=arrived.__getitem__, reverse=True)
+    why = _ADVICE[seen[0]] if seen else "is the sensor powered and its cable in?"
     return f"{f'only {came}' if came else 'nothing'} came: {why} edge-sr doctor{source} shows what is wrong"

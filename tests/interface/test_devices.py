@@ -119,6 +119,7 @@ def counted(said):
         (counted(b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,*47\n"), r"only .*skipped_bytes \d+.* line speed"),
         (counted(b"t1238AABBCCDDEEFF0011\r"), r"only .*frames 100.*--id-map"),
         ({"messages": 5, "welcomes": 1, "without_readings": 4}, "without_readings 4 came: .* name no sensor"),
+        ({"messages": 9, "without_readings": 1, "bad_json": 8}, "came: messages are no JSON"),
         (
             {"received_bytes": 240, "status_answers": 60},
             "only received_bytes 240 came: is the sensor powered .*edge-sr doctor",
