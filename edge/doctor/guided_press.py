@@ -315,9 +315,9 @@ def _weigh(weight_g: float) -> Dialogue[Weighed | None]:
         del steady[:-STEADY_SCANS]
         if len(steady) < STEADY_SCANS:
             return False
-        # Means of ten scans: usual noise of 4 counts a taxel spreads them over 12.
-        sums = np.abs(np.sum(steady, axis=(1, 2))).reshape(-1, 10).mean(axis=1)
-        return bool(sums.min() > 100.0 and np.ptp(sums) < max(20.0, 0.02 * sums.max()))
+        # Means of ten scans: usual noise of 4 counts a taxel spreads them over 12. The mean size of noise is a load.
+        sums = np.sum(steady, axis=(1, 2)).reshape(-1, 10).mean(axis=1)
+        return bool(abs(sums).min() > 100.0 and np.ptp(sums) < max(20.0, 0.02 * abs(sums).max()))
 
     ask = f"Lay {weight_g:g} g on the pad, flat and covering all of it, hands off."
     laid = yield from _wait(ask, lies_still, 1)

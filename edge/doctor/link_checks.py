@@ -38,7 +38,7 @@ class Watched:
 
 
 def check_id_map(watched: Watched, half_silent: bool) -> Finding | None:
-    """Check that the chosen id map fits the CAN ids that came; half a sensor may be silent. None if none came."""
+    """Check the id map by the CAN ids that came, and by whether some sensor is half silent; None if none came."""
     ids, model = watched.ids, watched.model
     if not ids:
         return None

@@ -66,7 +66,7 @@ def _watch(waking: socket.socket, numbers: Collection[int]) -> None:
                 if select.select([], [STDERR], [], 0)[1]:  # an unread pipe may be what blocks the program
                     os.write(STDERR, f"edge-sr: not ended {END_S:g} s after the signal: ended by force\n".encode())
             os.kill(os.getpid(), signal.SIGKILL)  # a shell restores the terminal after a signal, not after an exit
-            return
+            os._exit(128 + signal.SIGKILL)  # the first process of a container cannot be killed by one within
         if not received:
             return
         if set(numbers) & set(received):

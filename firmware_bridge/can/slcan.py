@@ -2,7 +2,8 @@
 
 A line ends at CR, or at BEL, an adapter's refusal. Its frame is the text from the LAST frame letter (t T r R) to the
 CR: hex digits hold no such letter, so one in mid-line begins a whole frame after the remains of another, or after
-noise. That text must fit its own length digit exactly, or the line gives no frame.
+noise. That text must fit its own length digit exactly, or the line gives no frame. Too few characters for eight bytes
+follow a digit that was damaged into a letter, but for the length digit of a stamped line: that frame has no stamp.
 
 An adapter stamps either every line with a time or no line. The decoder learns the form from LINES_TO_LEARN frames in a
 row of one form; from then on a frame of the other form is a bad line, until as many of those come in a row. So four

@@ -13,9 +13,9 @@ SLOWER: Final = 64  # share of the time by which the smallest difference grows: 
 # Largest step back of the stamps before the clock counts as set or restarted: frames that change places in a driver's
 # queues step back by less than a millisecond. A wall clock set back by less, plus the pause, goes unnoticed.
 BACK_NS: Final = 4_000_000
-LONGEST_STEP_NS: Final = 20_000_000  # of the time between two arrivals counts at most: a late read makes no clock slow
-# In a row in which stamps advance twice as far as arrivals, or too slowly while reads were late: a backlog makes it so
-# once, and so does a machine that stood still.
+LONGEST_STEP_NS: Final = 20_000_000  # most that counts between two arrivals: a late read is no evidence of a slow clock
+# Judgements in a row by which stamps advance twice as far as arrivals, or too slowly while reads were late: a backlog
+# makes it so once, and so does a machine that stood still.
 MOST_OFF: Final = 3
 SLOW_NS: Final = 10_000_000_000  # without a difference as small as the smallest, after which the clock is too slow
 

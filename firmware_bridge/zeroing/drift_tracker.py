@@ -19,7 +19,9 @@ from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 GAP_NS: Final = 5_000_000_000  # time without a scan after which the pad may have been replaced or moved, in [ns]
 COMMON_PER_S: Final = 20.0  # highest common drift that is followed, in [counts/s]: above any drift on record
-COMMON_COUNTS: Final = 50.0  #
+# Most common change ahead of the followed drift that is no touch: a pad turned over in the earth's field moves by 36
+# counts; at this limit the summed z is still half of a contact's.
+COMMON_COUNTS: Final = 50.0
 OWN_SHARE: Final = 0.65  # most own drift of a taxel over the common one: six tenths are seen, and a press has over one
 STILL_COUNTS: Final = 7.0  # most between two blocks at rest: the highest noise measured is 4.7 counts, 1.6 for that
 STEP_COUNTS: Final = 15.0  # change of rest level that is reported: more than noise and the end of a recovery cause

@@ -76,6 +76,15 @@ def test_waiting_ends_with_the_timeout_and_who_is_late_gets_all(tmp_path):
         assert time.now_ns == scan.time_ns == START_NS + 400 * MS, "the grid stays"
 
 
+def test_it_may_wait_for_a_sign_to_begin(tmp_path):
+    time, begins = FakeTime(), threading.Event()
+    with replay(time, write_recording(tmp_path / "finger.csv", make_counts(2)), rate_hz=10, begins=begins) as link:
+        assert link.read(0.01) == []
+        time.now_ns += 900 * MS
+        begins.set()
+        assert [scan.time_ns for _ in range(2) for scan in link.read(1.0)] == [START_NS + ms * MS for ms in (900, 1000)]
+
+
 def test_sources_without_a_name_are_called_by_their_place(tmp_path):
     """Not "1/4", which reads like the first of four sensors."""
     forms = []

@@ -167,6 +167,10 @@ class TestPerson:
             _, guide = answer_to([*visit(), *laid, *np.zeros((30, 3, 4, 4))], typed=["200"])
             assert guide.weighed == (pytest.approx((1200.0, 0.08), rel=0.02) if np.ptp(share) == 0 else None)
 
+    def test_strong_noise_of_a_free_pad_is_no_weight(self):
+        free = np.random.default_rng(1).normal(0, 40, (2000, 3, 4, 4))
+        assert answer_to([*visit(), *free], typed=["200"])[1].weighed is None
+
     @pytest.mark.parametrize("wrong", ["0.2", "19", "4001", "nan", "-200", "200 g", "\x1b[2J"])
     def test_what_is_no_mass_in_grams_is_asked_again(self, wrong):
         asked, guide = answer_to(visit(), typed=[wrong, " 200 "])

@@ -240,6 +240,15 @@ def test_keys_zero_and_the_terminal_is_restored_on_stop_and_end(terminal):
     assert b"scans, " in terminal.shown
 
 
+def test_the_program_restores_the_terminal_itself(terminal):
+    """Bash does it at the end of a program that was stopped before, and so in the test above."""
+    terminal.type("\x03")
+    terminal.until(lambda: b"scans, " in terminal.shown)
+    terminal.type("echo ended by $?.\n")
+    terminal.until(lambda: b"ended by 0." in terminal.shown)
+    assert terminal.line_mode()
+
+
 @pytest.fixture
 def window():
     """Both ends of a pseudo-terminal of 80 columns; ours is never waited for."""
