@@ -1,6 +1,8 @@
 """`edge-sr convert`: an .mcap as arrays or as CSV, with what was recorded of it; nothing is computed."""
 
 import argparse
+import shutil
+import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, TextIO
@@ -9,6 +11,7 @@ from edge.errors import SinkError, UsageError
 from edge.perception.record_fields import FIELDS, Out
 from edge.pipeline.sink import check_new
 from edge.sinks.converted_files import write_csv, write_npz
+from edge.terminal.stop_signals import handled
 from firmware_bridge.errors import as_typed
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording.formats import load_recording
@@ -29,7 +32,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Write a recording in the format that the new name ends in, as CSV a file for each sensor."""
     source, target = Path(options.recording), Path(options.new)
     ending = target.suffix.lower()
-    if source.suffix.lower() != ".mcap":
+    if source.suffix.lower() in {".npz", ".csv"}:
         made = as_typed(f"mcap:{source.with_suffix('.mcap')}")
         raise UsageError(f"{source} is no .mcap: edge-sr replay {as_typed(source)} --sink {made} makes one")
     if ending not in _WITHOUT:
@@ -65,8 +68,17 @@ def _files(target: Path, tracks: Sequence[Track]) -> Mapping[Path, Sequence[Trac
 def _write(recording: Recording, path: Path, tracks: Sequence[Track]) -> int:
     """Write one file, read it back before it gets its name, and return how many scans are in it."""
     read: list[int] = []
+    drafts: list[Path] = []
+
+    def end(number: int, frame: object) -> None:
+        """Remove the draft, and end; an exception might be lost in a callback, such as one of an import."""
+        for draft in drafts:
+            shutil.rmtree(draft.parent, ignore_errors=True)
+        signal.signal(number, signal.SIG_DFL)
+        signal.raise_signal(number)
 
     def write(draft: Path) -> None:
+        drafts.append(draft)
         if path.suffix.lower() == ".npz":
             write_npz(draft, recording)
         else:
@@ -79,7 +91,8 @@ def _write(recording: Recording, path: Path, tracks: Sequence[Track]) -> int:
             read.append(len(load_recording(draft).tracks[0].counts))
 
     try:
-        write_in_place(path, write, load, keep_before=False)
+        with handled(("SIGINT", "SIGTERM", "SIGHUP"), end):
+            write_in_place(path, write, load, keep_before=False)
     except OSError as error:
         raise SinkError(f"cannot write {path}: {error.strerror or error}") from error
     return read[0]

@@ -29,6 +29,7 @@ from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.zeroing import baseline as zeroing
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, BaselineEstimator, deformation
 
+_LONGER: Final = "watch for longer: --drift-s 60"
 _PRESSED: Final = (
     "something presses: free the pad, and repeat; this baseline is not stored. If it is free, the earlier baseline is "
     "too old: zero again, with edge-sr baseline"
@@ -58,8 +59,11 @@ def judge(watched: Watched, unix_time_s: float) -> Examined:
     if not enough:
         link_faulty = any(finding.verdict == "wrong" for finding in findings)
         remedy = "see above" if link_faulty else "is the sensor powered, and is nothing else reading it?"
+        early = watched.stopped and watched.duration_s < 1 and not link_faulty  # no sensor had the time
         scans = f"{sum(samples.scans for samples in sampled.values())} scans"
-        findings.append(Finding("scans", "wrong", scans, f"at least {fewest} of a sensor", remedy))
+        norm = f"at least {fewest} of a sensor"
+        found = ("not known", scans, norm, _LONGER) if early else ("wrong", scans, norm, remedy)
+        findings.append(Finding("scans", *found))
     wrong_map = id_map is not None and id_map.verdict == "wrong"
     last_ns = (scans[-1].time_ns for scans in watched.scans.values() if scans)
     newest_ns = watched.until_ns if watched.until_ns is not None else max(last_ns, default=0)
@@ -102,7 +106,7 @@ def check_baseline(
     usable = [scan for scan in scans if scan.complete and scan.renewed.any()][-needed:]
     if len(usable) < needed:
         measured = f"only {len(usable)} complete scans"
-        return None, Finding("baseline", "not known", measured, norm, "watch for longer: --drift-s 60")
+        return None, Finding("baseline", "not known", measured, norm, _LONGER)
     estimator = BaselineEstimator(needed, clock=lambda: unix_time_s)
     baseline = None
     try:
@@ -160,7 +164,7 @@ def watch(reader: LinkReader, watched: Watched, length_s: float, stop: threading
                 watched.duration_s = now_s - start_s
                 bar.update(min(watched.duration_s, length_s) - bar.n)
     finally:
-        watched.counters, watched.ids = link.counters(), link.can_ids()
+        watched.counters, watched.ids, watched.stopped = link.counters(), link.can_ids(), stop.is_set()
         if (line := link.serial_line()) is not None:
             watched.port, watched.baud = line
             watched.latency_ms = latency_timer_ms(watched.port)

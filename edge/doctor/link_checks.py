@@ -26,6 +26,7 @@ class Watched:
     scans: dict[str, list[Scan]] = field(default_factory=dict)  # of each sensor, in their order
     counters: Mapping[str, int] = field(default_factory=dict)  # of the link
     duration_s: float = 0.0  # length of the watch so far, in [s]
+    stopped: bool = False  # whether it ended before its time, at a user's wish
     port: str | None = None  # of a serial adapter; None for other links
     baud: int | None = None  # speed at which its line was opened, in bit/s
     latency_ms: int | None = None  # time for which the adapter's driver holds bytes back; None where it is not shown

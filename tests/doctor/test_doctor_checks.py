@@ -152,6 +152,11 @@ class TestSensor:
         scans = as_scans(healthy_counts(), times_ns(rate_hz=rate_hz))
         assert faults(scans, rate_hz=wanted_hz).get("rate") == verdict
 
+    def test_ctrl_c_at_once_makes_no_fault(self):
+        for stopped, length_s, verdict in ((True, 0.3, "not known"), (True, 1.5, "wrong"), (False, 0.3, "wrong")):
+            few = Watched({"4": as_scans(healthy_counts(20))}, COUNTERS, length_s, stopped=stopped)
+            assert [one.verdict for one in judge(few, 0.0).findings if one.name == "scans"] == [verdict]
+
     def test_too_few_scans_tell_nothing(self):
         assert faults(as_scans(healthy_counts(20), times_ns(20))) == {"scans": "wrong"}
         assert faults(as_scans(healthy_counts(80), times_ns(80))) == {"baseline": "not known"}

@@ -95,6 +95,10 @@ def test_what_is_no_checkpoint_is_refused_by_name(folder, tmp_path, damage, caps
         path.with_suffix(".json").write_text(report)
     with pytest.raises(CheckpointError, match=r"net\.pt is no checkpoint of train\.fit with net\.json"):
         load_network(path)
+    graph = tmp_path / "net.onnx"
+    graph.write_bytes(b"\xff\xff\xff")
+    with pytest.raises(CheckpointError, match=r"net\.onnx is no model to start from"):
+        load_network(graph)
     assert "it ran" not in capsys.readouterr().out
 
 

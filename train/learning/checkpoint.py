@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 import onnx
 import torch
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from onnx import numpy_helper
 
@@ -159,7 +160,7 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
         report = json.loads(path.with_suffix(".json").read_text())
         net = build(report["network"], report["scale"], **report["options"])
         net.load_state_dict(torch.load(path, weights_only=True))
-    except DAMAGES as error:
+    except (*DAMAGES, DecodeError) as error:
         graph = path.suffix == _GRAPH
         what = "no model to start from" if graph else f"no checkpoint of train.fit with {path.stem}.json"
         raise CheckpointError(f"{path} is {what}: {reason(error)}") from error
