@@ -81,13 +81,6 @@ class SourceError(BridgeError, ValueError):
     """A text that names no source."""
 
 
-def interrupted(error: BaseException | None) -> bool:
-    """Return whether Ctrl-C came, also where what it cut off failed then: zipfile closes no archive in mid-array."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__context__
-    return error is not None
-
-
 def how_to_install(extra: str) -> str:
     """Return the command that installs an extra of pyproject.toml, in a checkout or beside an installed wheel."""
     where = _FOLDER if (_FOLDER / "pyproject.toml").is_file() else "tactile-edge-sr"

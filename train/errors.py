@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from edge.errors import EdgeError
-from firmware_bridge.errors import BridgeError, interrupted
+from firmware_bridge.errors import BridgeError
 
 
 class TrainError(Exception):
@@ -34,7 +34,7 @@ def ended_by_errors(program: str) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        if interrupted(error):
+        if _interrupted(error):
             sys.stderr.write(f"{program}: interrupted; the same command continues\n")
             sys.exit(130)
         if isinstance(error, (TrainError, BridgeError, EdgeError)):
@@ -43,3 +43,10 @@ def ended_by_errors(program: str) -> Iterator[None]:
             where = f"{error.filename}: " if error.filename else ""
             sys.exit(f"{program}: {where}{error.strerror or error}")
         raise
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C came, also where what it cut off failed then: zipfile closes no archive in mid-array."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None

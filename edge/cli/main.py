@@ -23,7 +23,7 @@ from edge.api import (
 from edge.cli.option_table import COMMAND_LIST, COMMANDS, EXAMPLES, TABLE, runtime_options
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import EXIT_USAGE, Parser
-from firmware_bridge.errors import harmless, interrupted
+from firmware_bridge.errors import harmless
 
 STDIN, STDOUT, STDERR = 0, 1, 2
 _FIXED: Final[dict[str, dict[str, Any]]] = {
@@ -46,9 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except KeyboardInterrupt:
         return 130  # as a shell's, until a run has begun that ends well
-    except (BridgeError, EdgeError, OSError, ValueError) as error:
-        if interrupted(error):
-            return 130
+    except (BridgeError, EdgeError, OSError) as error:
         lacking = error.__cause__ if isinstance(error, (BridgeError, EdgeError)) else error
         if isinstance(lacking, OSError) and lacking.errno in (errno.EMFILE, errno.ENFILE):
             # Anything may meet it: a thread, a link, a port that is opened, or Python as it loads a module.
