@@ -14,7 +14,7 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 from train.data.presses import SEED
-from train.families.family_shares import tap
+from train.families.catalogue import tap
 from train.physics.contact import BARE
 from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad, Taps, between_frames
 from train.physics.magnets import Magnet, dipole_mt

@@ -26,7 +26,7 @@ from train.data.press_batches import read_presses
 from train.data.presses import SEED, PressSet, join_presses, load_presses, one_thread
 from train.demo import demo_recording, grip_recording
 from train.errors import ended_by_errors
-from train.families.family_shares import tap
+from train.families.catalogue import tap
 from train.networks.symmetric import moved_scans
 from train.physics.gripped import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SCALE, GrippedPad, between_frames
 from train.physics.pad_draws import NOMINAL

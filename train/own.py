@@ -42,7 +42,7 @@ from train.data.real_grips import Grip, grips_of, has_hole, play
 from train.data.recorded_taps import load_tap_parts
 from train.data.world import World, solve_pad
 from train.errors import DatasetError, TrainError, ended_by_errors
-from train.families.family_shares import FIGURES, SHARES
+from train.families.catalogue import FIGURES, SHARES
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
 from train.physics.gripped import SCALE

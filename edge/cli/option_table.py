@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
 from edge.mapping.object_map import PX_PER_MM, SIZE_MM
-from edge.perception.contact_options import RuntimeOptions
+from edge.perception.run_options import RuntimeOptions
 from edge.sinks.registry import FORMS as SINKS
 from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.links.registry import FORMS as SOURCES

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.doctor.findings import Finding, judged
-from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
+from edge.perception.run_options import OFF_COUNTS, ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.doctor.findings import Finding, graded, judged, worst
-from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.result import NOISE_COUNTS
+from edge.perception.run_options import OFF_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
 from edge.pipeline.cadence import Cadence
 from firmware_bridge.pad_geometry import AXES

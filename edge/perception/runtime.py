@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from edge.errors import UsageError, WindowError
 from edge.inference.contract import Model
 from edge.inference.intervals import doubt
-from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.event import OLD_NS, UNCHECKED, Event, EventKind, age_notes, notes_on_missing
 from edge.perception.gain_learning import ContactModel, Learn
 from edge.perception.pattern_description import Describe
 from edge.perception.result import Estimate, LastPattern, Result, Step, Window
+from edge.perception.run_options import DEFAULTS, RuntimeOptions
 from edge.perception.taps import Taps, TapTracker
 from edge.perception.taxel_health import Health
 from edge.perception.trust_check import PatternCheck, SensorPad

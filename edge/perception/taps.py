@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract, pose_rows, scheduled_rows
-from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import EventKind, Report
 from edge.perception.result import NextTap, Step, Window
+from edge.perception.run_options import RuntimeOptions
 from edge.perception.taxel_health import REPEATS, Health
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack

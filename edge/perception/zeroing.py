@@ -12,9 +12,9 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import Note, Report
 from edge.perception.result import Step, age_text
+from edge.perception.run_options import RuntimeOptions
 from edge.perception.taps import TapTracker
 from edge.perception.taxel_health import Health
 from firmware_bridge.errors import BaselineRefusedError

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from edge.errors import UsageError
 from edge.inference.bundled import TAXELS, find_model, taps_of
 from edge.inference.contract import Model
-from edge.perception.contact_options import RuntimeOptions
 from edge.perception.gain_learning import load_contact_model
 from edge.perception.result import Result
+from edge.perception.run_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import load_estimator
 from edge.pipeline.result_stream import Stream

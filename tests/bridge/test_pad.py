@@ -19,7 +19,7 @@ from edge_samples import (
 
 from edge.errors import ModelError, WindowError
 from edge.inference.onnx_session import ModelSession
-from edge.perception.contact_options import RuntimeOptions
+from edge.perception.run_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAINS, LEVEL_90, Pad

@@ -17,7 +17,7 @@ from train.errors import CheckpointError
 from train.experiments.__main__ import run
 from train.experiments.trust_checks import CONTACTS, FAULTS, judged, share, verdicts_on
 from train.experiments.workbench import infer_presses
-from train.families.family_shares import SHARES
+from train.families.catalogue import SHARES
 from train.report import Report, bootstrap_interval
 
 

@@ -14,7 +14,7 @@ from edge.cli import run_command
 from edge.cli.demo import SLIDE, Demo
 from edge.cli.main import parsed_options
 from edge.evaluation.metrics import psnr_db, rmse_percent
-from edge.perception.contact_options import RuntimeOptions
+from edge.perception.run_options import RuntimeOptions
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 from train.demo import TAP_FRAMES

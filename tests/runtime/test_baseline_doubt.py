@@ -13,7 +13,7 @@ from runtime_samples import Pushed, make_runtime
 from trust_samples import make_trusted_contract
 
 from edge.api import USPA44, Baseline, Source, Stream, open_runtime
-from edge.perception.contact_options import RuntimeOptions
+from edge.perception.run_options import RuntimeOptions
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 

@@ -14,7 +14,6 @@ from trust_samples import make_trust
 from edge.api import USPA44, EdgeError, SensorFileError, Source, Stream
 from edge.cli import main as cli
 from edge.inference.bundled import CONTACTS
-from edge.perception.contact_options import RuntimeOptions
 from edge.perception.gain_learning import (
     BOUND,
     CONTRADICTED_CONTACTS,
@@ -23,6 +22,7 @@ from edge.perception.gain_learning import (
     Learn,
     load_contact_model,
 )
+from edge.perception.run_options import RuntimeOptions
 from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
 from firmware_bridge.scans.pad_constants import GAINS, Pad

@@ -13,7 +13,7 @@ from trust_samples import make_checked_contract, make_posed_trust
 from edge.api import USPA44, PadPose, UsageError
 from edge.inference.contract import pose_rows, scheduled_rows
 from edge.inference.onnx_session import ModelSession
-from edge.perception.contact_options import RuntimeOptions
+from edge.perception.run_options import RuntimeOptions
 from edge.perception.taps import next_shift_mm
 
 POSES = [PadPose(0, 0, 0), PadPose(2, 1, 5, 0.1, 2), PadPose(3, -1, 90, 0.3, 0.5)]

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.api import Baseline, UsageError, WindowError
-from edge.perception.contact_options import RuntimeOptions
 from edge.perception.pattern_description import touched, touched_patch
+from edge.perception.run_options import RuntimeOptions
 from firmware_bridge.scans.mounting import Mounting
 
 SURE = make_contract(interval_factor=1.6)

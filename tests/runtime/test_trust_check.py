@@ -10,7 +10,7 @@ from trust_samples import FOREIGN_TAXEL, make_trust, make_trusted_contract
 
 from edge.api import Pad
 from edge.inference.contract import scheduled_rows
-from edge.perception.contact_options import RuntimeOptions
+from edge.perception.run_options import RuntimeOptions
 from edge.perception.taxel_health import REPEATS
 from edge.perception.trust_check import (
     LEAST_COUNTS,

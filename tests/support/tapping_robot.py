@@ -21,7 +21,7 @@ from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, Pa
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train.data.presses import PressSet, one_thread
-from train.families.family_shares import heights_of
+from train.families.catalogue import heights_of
 from train.physics.gripped import FINE_SCALE, SAMPLES, SCALE, GrippedPad, Taps, between_frames
 from train.physics.pad_draws import INPUTS, RANGES, constants, draw_pad
 from train.physics.tpsf import resample, resample_touching

@@ -15,8 +15,8 @@ from websockets.sync.client import connect
 
 from edge.mapping.object_map import ObjectMap
 from edge.mapping.sink import MapSink
-from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import Event
+from edge.perception.run_options import RuntimeOptions
 from edge.pipeline.commands import Commands
 from edge.view.server import LiveView
 from firmware_bridge.poses import PadPose

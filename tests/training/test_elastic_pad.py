@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_bridge.pad_geometry import USPA44
 from train.errors import SurfaceError
-from train.families.family_shares import heights_of
+from train.families.catalogue import heights_of
 from train.families.shapes import NOWHERE_MM
 from train.physics.contact import BARE, ContactSolver, FrictionSolver
 from train.physics.elastic_layer import (

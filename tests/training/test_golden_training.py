@@ -12,7 +12,7 @@ from train.data.press_batches import PosedBatches, PressBatches, read_presses, s
 from train.data.presses import join_presses
 from train.data.world import World, solve_pad
 from train.experiments.trust_checks import FAULTS
-from train.families.family_shares import SHARES
+from train.families.catalogue import SHARES
 from train.learning.checks import moved, spoiled
 from train.physics.sensor_noise import Nuisances
 from train.physics.tpsf import resample

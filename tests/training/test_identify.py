@@ -17,7 +17,7 @@ from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import identify
 from train.data.real_grips import play, recorded_grips
 from train.errors import DatasetError
-from train.families.family_shares import BARE
+from train.families.catalogue import BARE
 from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z, learned, write_model
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import RANGES

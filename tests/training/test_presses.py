@@ -10,7 +10,7 @@ from train.data.frozen_presses import freeze_presses, load_frozen_presses
 from train.data.press_batches import COUNTS_PER_UNIT, PressBatches
 from train.data.presses import join_presses, load_presses
 from train.errors import DatasetError
-from train.families.family_shares import SHARES
+from train.families.catalogue import SHARES
 from train.learning.checkpoint import batches_of
 from train.learning.training_loop import Recipe
 from train.physics.pad_draws import INPUTS

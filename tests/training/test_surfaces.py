@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from train.errors import MeshError, SurfaceError
-from train.families.family_shares import SHARES, draw_shape
+from train.families.catalogue import SHARES, draw_shape
 from train.families.shapes import NOWHERE_MM
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import NOMINAL

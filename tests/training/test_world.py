@@ -22,7 +22,7 @@ from train.data.make_presses import main, make_presses
 from train.data.presses import load_presses
 from train.data.world import INDENTATION_MM, LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, ended_by_errors
-from train.families.family_shares import SHARES, tap
+from train.families.catalogue import SHARES, tap
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
 from train.physics.gripped import MOST_FORCE_N, GrippedPad

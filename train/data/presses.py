@@ -58,7 +58,7 @@ def one_thread() -> Iterator[None]:
 class PressSet:
     """n sequences of K presses, newest first, each at one moment, with the newest one's truth."""
 
-    family: NDArray[np.str_]  # (n,) names, see train.families.family_shares
+    family: NDArray[np.str_]  # (n,) names, see train.families.catalogue
     pad: NDArray[np.int64]  # (n,), number of the pad within the set
     constants: NDArray[np.float32]  # (n, p) of the pads, over their spread, see train.physics.pad_draws
     counts: NDArray[np.float32]  # (n, K, 3, rows, cols), zeroed, without nuisances

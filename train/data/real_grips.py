@@ -12,7 +12,7 @@ from scipy.ndimage import binary_fill_holes
 
 from edge.inference.bundled import TAXELS
 from edge.inference.onnx_session import ModelSession
-from edge.perception.contact_options import ON_COUNTS, RuntimeOptions
+from edge.perception.run_options import ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import load_estimator
 from firmware_bridge.pad_geometry import AXES, USPA44

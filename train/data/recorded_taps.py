@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
+from edge.perception.run_options import OFF_COUNTS, ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import GAP_NS, PadPose, PoseTrack
 from firmware_bridge.recording.csv_reader import CSV_POSES

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.presses import VERSION, PressSet, join_presses, one_thread
 from train.errors import DatasetError
-from train.families.family_shares import SHARES, Tapped, draw_shape
+from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
 from train.physics.sensor_noise import log_uniform

@@ -23,7 +23,7 @@ from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, with_scal
 from train.data.presses import PressSet
 from train.data.world import World
 from train.experiments.workbench import Workbench, infer, name_of
-from train.families.family_shares import BARE, FIGURES, SHARES
+from train.families.catalogue import BARE, FIGURES, SHARES
 from train.learning.ball_fit import fit_ball
 from train.learning.contact_mixture import learned, place_effects
 from train.own import COMPARED, Knowledge, Plan, compared, knowledge_of, trained

@@ -26,7 +26,7 @@ from train.data.press_batches import in_units, read_presses
 from train.data.presses import SEED, one_thread
 from train.data.world import World, press_shapes
 from train.experiments.workbench import SHORT, Inferred, Workbench, infer_presses, name_of
-from train.families.family_shares import SHARES, Tapped, draw_shape
+from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.learning.checkpoint import best_contact_level
 from train.physics.gripped import MAX_INDENTATION_MM, SCALE, GrippedPad
 from train.physics.pad_draws import INPUTS, NOMINAL, Pad

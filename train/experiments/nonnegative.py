@@ -25,7 +25,7 @@ from train.data.presses import SEED
 from train.experiments.posed_taps import PAPER, USUAL, presses_of
 from train.experiments.second_world import SEEDS, draw_presses
 from train.experiments.workbench import Workbench, infer, known_pads, name_of
-from train.families.family_shares import FIGURES
+from train.families.catalogue import FIGURES
 from train.physics.contact import BARE, ContactSolver
 from train.physics.gripped import MAX_INDENTATION_MM, SCALE, GrippedPad
 from train.physics.pad_draws import Pad

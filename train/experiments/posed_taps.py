@@ -21,7 +21,7 @@ from train.data.press_batches import stated_poses
 from train.data.presses import SEED, PressSet
 from train.data.world import World
 from train.experiments.workbench import Workbench, infer, known_pads, name_of
-from train.families.family_shares import FIGURES, SHARES
+from train.families.catalogue import FIGURES, SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
 from train.surfaces.poses import MAX_TAPS

@@ -13,8 +13,8 @@ from scipy.stats import beta
 
 from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.onnx_session import ModelSession
-from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.result import NOISE_COUNTS, Result
+from edge.perception.run_options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Model, Runtime
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
@@ -27,7 +27,7 @@ from train.data.real_grips import play, recorded_grips, recording_paths, recordi
 from train.data.world import World
 from train.errors import CheckpointError
 from train.experiments.workbench import Workbench, known_pads
-from train.families.family_shares import SHARES
+from train.families.catalogue import SHARES
 from train.learning.checks import magnet_field
 from train.networks.symmetric import symmetries
 from train.report import Report, Row, bootstrap_interval

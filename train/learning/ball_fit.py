@@ -17,7 +17,7 @@ from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.pad_constants import LEVEL_90
 from firmware_bridge.scans.pad_constants import Pad as SensorPad
 from train.errors import DatasetError
-from train.families.family_shares import BARE
+from train.families.catalogue import BARE
 from train.physics.gripped import MAX_INDENTATION_MM, GrippedPad
 from train.physics.pad_draws import RANGES, Pad
 from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances, neighbours

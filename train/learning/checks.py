@@ -22,7 +22,7 @@ from edge.inference.trust_model import (
     pose_tap_features,
     small_network,
 )
-from edge.perception.contact_options import OFF_COUNTS
+from edge.perception.run_options import OFF_COUNTS
 from edge.perception.trust_check import LEAST_COUNTS
 from firmware_bridge.pad_geometry import USPA44
 from train.data.press_batches import in_units, read_presses, stated_poses
