@@ -1,13 +1,16 @@
 """Readings to scans: where a scan is cut, what is counted, and which sensors exist."""
 
 import random
+from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.scans.scan_assembler import Readings, ScanAssembler, key
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, MOST_DOUBTS
@@ -168,14 +171,31 @@ def test_every_reading_is_in_a_scan_or_counted(seed, percent_lost):
         assert (scan.counts[2][scan.fresh] == 3000 + numbers).all()
 
 
+def play(assembler: ScanAssembler, number: int) -> list[int]:
+    """Feed a cycle reading by reading, 100 a second, and return the numbers of the cycles that close."""
+    times_ns = range(number * 10_000_000, (number + 1) * 10_000_000, 250_000)
+    scans = [scan for one, at in zip(cycle(number), times_ns, strict=False) for scan in feed_all(assembler, [one], at)]
+    return [int(scan.counts[2, 0, 0]) - 3000 for scan in scans]
+
+
+def test_cycles_that_wait_for_one_in_time_are_counted():
+    """A lost cycle makes the next ones late: they may be parts of two, and none came in time."""
+    assembler = ScanAssembler(USPA44_MAP)
+    assert [number for one in [*range(60), *range(61, 66)] for number in play(assembler, one)] == [*range(60), 64, 65]
+    assert assembler.counters()["resynchronised"] == 3 * 16
+
+
+def test_a_frame_tells_when_it_was_on_the_bus():
+    assembler, order = ScanAssembler(USPA44_MAP), USPA44_MAP.wire_order("4")
+    frames = [CanFrame(can_id, bytes(8)) for can_id, _ in order]
+    for at_ns, frame in enumerate(frames * 2):  # the device's clock began 1000 ns before the host's
+        scans = assembler.feed_frame(frame, 5000 + at_ns, DeviceTime(host_ns=4000 + at_ns, own_ns=5000 + at_ns))
+    assert [(scan.device_ns, scan.time_ns) for scan in scans] == [(4031, 5031)]
+
+
 def test_a_scan_held_back_when_the_link_broke_never_comes():
     assembler, ms = ScanAssembler(USPA44_MAP), 1_000_000
-
-    def played(number: int) -> list[int]:
-        readings = enumerate(cycle(number))
-        scans = [scan for i, one in readings for scan in feed_all(assembler, [one], number * 10 * ms + i * ms // 4)]
-        return [int(scan.counts[2, 0, 0]) - 3000 for scan in scans]
-
+    played = partial(play, assembler)
     assert [number for paced in range(60) for number in played(paced)] == [*range(60)]
     assert played(61) == [], "a cycle was lost, so it may be parts of two"
     assembler.begin_anew()

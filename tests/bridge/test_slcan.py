@@ -123,6 +123,8 @@ def test_the_form_of_lines_is_learnt_from_four_in_a_row(usual, other):
     assert decoder.usual_line_bytes == len(GOLDEN)
     decoder.cut(b"".join(usual))
     assert decoder.usual_line_bytes == len(usual[0])
+    decoder.begin_anew()
+    assert decoder.usual_line_bytes == len(GOLDEN), "an adapter that was opened again may send another form"
     # Before that both are taken, in any order.
     assert len(decode(b"".join((usual[:few] + other[:few]) * 3))[0]) == 6 * few
     # Then those of the other form are bad lines: damage, such as four lost digits.
