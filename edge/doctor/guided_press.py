@@ -323,7 +323,7 @@ def _weigh(weight_g: float) -> Dialogue[Weighed | None]:
     laid = yield from _wait(ask, lies_still, 1)
     if laid is None:
         return None
-    mean = np.mean(steady, axis=0)
+    mean = np.mean(steady[10:], axis=0)  # the oldest ten may hold the end of laying it down
     mean *= np.sign(mean.sum())
     covered = mean.min() >= LEAST_SHARE * mean.mean()
     yield from _wait("Good. Take it off.", _free, FREE_SCANS)

@@ -154,7 +154,7 @@ class TestPerson:
         script = [*visit(), *laid, *np.zeros((30, 3, 4, 4))]
         asked, guide = answer_to(script, typed=["200"])
         assert asked[-2:] == ["Lay 200 g on the pad, flat and covering all of it, hands off.", "Good. Take it off."]
-        assert guide.weighed == pytest.approx((z_counts / 1.96133, error), rel=0.03)
+        assert guide.weighed == pytest.approx((z_counts / 1.96133, error), rel=0.02)
         finding = judge_force(guide.weighed, kept=False)
         assert finding.verdict == verdict and guide.weighed.plausible == kept == ("not kept" not in finding.remedy)
 
