@@ -74,13 +74,15 @@ class ContactSolver:
         layer: Layer,
         size: int,
         cell_mm: float,
+        dtype: torch.dtype = torch.float32,
         cover: Cover = BARE,
         sides: float = 0.0,
     ) -> None:
         self.size = size
         self.cell_mm = cell_mm
-        self._grid = PadGrid(layer, size, cell_mm, lambda q_x, q_y: cover.compliance(layer, np.hypot(q_x, q_y)))
-        self._side_give = SideGive.of(sides, layer, size, cell_mm) if sides else None
+        self._grid = PadGrid(layer, size, cell_mm, dtype, lambda q_x, q_y: cover.compliance(layer, np.hypot(q_x, q_y)))
+        self._dtype = dtype
+        self._side_give = SideGive.of(sides, layer, size, cell_mm, dtype) if sides else None
 
     @property
     def cell_compliance_mm_per_mpa(self) -> float:
@@ -89,8 +91,8 @@ class ContactSolver:
 
     def displacement_mm(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the surface displacement downwards under pressures (n, size, size), in [mm]."""
-        pressure = torch.as_tensor(pressure_mpa, dtype=torch.float32)
-        return self._respond(pressure, torch.zeros(()), self._side_give).numpy()
+        pressure = torch.as_tensor(pressure_mpa, dtype=self._dtype)
+        return self._respond(pressure, torch.zeros(()), self._side_give).numpy().astype(np.float32)
 
     def solve(
         self,
@@ -110,9 +112,9 @@ class ContactSolver:
         pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
         residual = np.zeros(len(depth_mm), dtype=np.float32)
         for poses, place in self._grid.boxes(depth_mm < REACH * indentation[:, None, None]):
-            press = torch.as_tensor(indentation[poses, None, None], dtype=torch.float32)
-            depth = torch.as_tensor(depth_mm[place], dtype=torch.float32)
-            share = torch.ones(()) if covered is None else torch.as_tensor(covered[place], dtype=torch.float32)
+            press = torch.as_tensor(indentation[poses, None, None], dtype=self._dtype)
+            depth = torch.as_tensor(depth_mm[place], dtype=self._dtype)
+            share = torch.ones(()) if covered is None else torch.as_tensor(covered[place], dtype=self._dtype)
             # The pressure on the covered share is 1 / share times the cell's mean.
             give = self.cell_compliance_mm_per_mpa * torch.where(share > 0, 1 / share - 1, 0.0)
             sides = None if self._side_give is None else self._side_give.boxes(*place[1:])
@@ -137,7 +139,7 @@ class ContactSolver:
         wanted = torch.where(reachable, press - depth, 0.0)
         pressure = wanted.clamp_min(0) / (self.cell_compliance_mm_per_mpa + give)
         give = give.expand_as(pressure)
-        result, residual = pressure.clone(), torch.zeros(len(pressure))
+        result, residual = pressure.clone(), torch.zeros(len(pressure), dtype=self._dtype)
         working = torch.arange(len(pressure))
         gap = torch.where(reachable, self._respond(pressure, give, sides) - wanted, 0.0)
         direction = torch.zeros_like(pressure)
@@ -172,7 +174,7 @@ class ContactSolver:
             # A cell without pressure that would overlap the surface returns to the contact; the search then restarts.
             returning = (pressure <= 0) & (gap < 0) & reachable
             pressure = torch.where(returning, -length.abs() * gap, pressure)
-            keep = (~returning.flatten(1).any(dim=1)).float()[:, None, None]
+            keep = (~returning.flatten(1).any(dim=1)).to(self._dtype)[:, None, None]
             # Where no cell was cut off or returned, the step was linear, and so is the gap's.
             bent = (returning | (stepped < 0)).flatten(1).any(dim=1)
             gap = torch.where(reachable, gap - length * response, 0.0)
@@ -204,7 +206,7 @@ _REMEMBERED: Final = 4  # past energies whose largest a step may not exceed: the
 class FrictionSolver:
     """Solver of poses on a square grid over one pad, with the arguments of `train.physics.contact.ContactSolver`."""
 
-    def __init__(self, layer: Layer, size: int, cell_mm: float) -> None:
+    def __init__(self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32) -> None:
         def compliance(q_x: NDArray[np.floating], q_y: NDArray[np.floating]) -> NDArray[np.float64]:
             xx, yy, xy = surface_tensor(layer, q_x, q_y)
             # The highest wave is its own mirror image, so an odd transfer is zero there.
@@ -213,11 +215,12 @@ class FrictionSolver:
 
         self.size = size
         self.cell_mm = cell_mm
-        self._grid = PadGrid(layer, size, cell_mm, compliance)
+        self._dtype = dtype
+        self._grid = PadGrid(layer, size, cell_mm, dtype, compliance)
 
     def displacement_mm(self, traction_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the surface displacement (n, 2, size, size) under tractions of that shape, in [mm]."""
-        return self._displace(torch.as_tensor(traction_mpa, dtype=torch.float32)).numpy()
+        return self._displace(torch.as_tensor(traction_mpa, dtype=self._dtype)).numpy().astype(np.float32)
 
     def solve(
         self,
@@ -245,8 +248,8 @@ class FrictionSolver:
         residual = np.zeros(count, dtype=np.float32)
         for poses, place in self._grid.boxes(limit_mpa > 0):
             traction, error = self._projected_gradients(
-                torch.as_tensor(limit_mpa[place], dtype=torch.float32)[:, None],
-                torch.as_tensor(np.stack([part[place] for part in moved_mm], axis=1), dtype=torch.float32),
+                torch.as_tensor(limit_mpa[place], dtype=self._dtype)[:, None],
+                torch.as_tensor(np.stack([part[place] for part in moved_mm], axis=1), dtype=self._dtype),
                 tolerance,
             )
             for part, axis in zip(traction_mpa.swapaxes(0, 1), range(2), strict=True):
@@ -268,7 +271,7 @@ class FrictionSolver:
         length = _dot(wanted, wanted) / _dot(wanted, response).clamp_min(1e-30)
         traction = _project(length * wanted, limit)
         slip = torch.where(touching, self._displace(traction) - wanted, 0.0)
-        result, residual = traction.clone(), torch.zeros(len(traction))
+        result, residual = traction.clone(), torch.zeros(len(traction), dtype=self._dtype)
         working = torch.arange(len(traction))
         energies = (_dot(traction, slip - wanted) / 2).expand(-1, _REMEMBERED, 1, 1).clone()
         steps = 0

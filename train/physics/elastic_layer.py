@@ -179,6 +179,7 @@ class PadGrid:
         layer: Layer,
         size: int,
         cell_mm: float,
+        dtype: torch.dtype,
         compliance: Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.float64]],
     ) -> None:
         # A period of eight thicknesses limits the error of a punch's force to 5e-4; with one of twice the pad it was
@@ -186,6 +187,7 @@ class PadGrid:
         period = 2 * max(size, ceil(4 * layer.thickness_mm / cell_mm))
         self._kernels = np.fft.irfft2(compliance(*waves(period, cell_mm)), s=(period, period))
         self._size = size
+        self._dtype = dtype
         # Powers of two suit the FFT, and are few, so that many presses share one.
         self._sides = [*(side for side in (8, 16, 32, 64, 128, 256) if side < size), size]
         self._spectra: dict[tuple[int, int], torch.Tensor] = {}
@@ -199,7 +201,7 @@ class PadGrid:
         """Return the kernels' spectra (..., 2 height, width + 1) on a box, which symmetry makes real."""
         if (height, width) not in self._spectra:
             rows, columns = (np.fft.ifftshift(np.arange(-side, side)) for side in (height, width))
-            kernels = torch.as_tensor(self._kernels[..., rows[:, None], columns], dtype=torch.float32)
+            kernels = torch.as_tensor(self._kernels[..., rows[:, None], columns], dtype=self._dtype)
             self._spectra[height, width] = torch.fft.rfft2(kernels).real
         return self._spectra[height, width]
 
@@ -275,13 +277,13 @@ class SideGive:
         self._along = along
 
     @classmethod
-    def of(cls, amplitude: float, layer: Layer, size: int, cell_mm: float) -> "SideGive":
+    def of(cls, amplitude: float, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype) -> "SideGive":
         """Return the compliance of the whole grid."""
         cells_mm, thickness_mm = (np.arange(size) - (size - 1) / 2) * cell_mm, layer.thickness_mm
         scale, apart_mm = amplitude / (layer.shear_modulus_mpa * thickness_mm), cells_mm[:, None] - cells_mm
         across = np.stack([_fall(cells_mm, reach * thickness_mm) for _, reach, _ in _GIVES])
         along = np.stack([scale * factor * _bell(apart_mm, spread * thickness_mm) for factor, _, spread in _GIVES])
-        falls, bells = (torch.as_tensor(part, dtype=torch.float32) for part in (across[None], along * cell_mm**2))
+        falls, bells = torch.as_tensor(across[None], dtype=dtype), torch.as_tensor(along * cell_mm**2, dtype=dtype)
         return cls((falls, falls), (bells, bells))
 
     def boxes(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> "SideGive":
