@@ -18,10 +18,11 @@ import torch
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from edge.bench.subjects import FROZEN_FILE
 from edge.errors import ModelError
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
-from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
+from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.contract import Contract
 from export.graph import ExportError, ParityError
 from export.parity import (
@@ -44,8 +45,6 @@ from train.report import Report, Row, markdown
 # Largest relative difference from the network, in any pixel: on readings, and on windows beyond any touch, where int8
 # saturates: it is off by the value itself, and the runtime believes no pattern there.
 BOUNDS: Final = {"float32": (TOLERANCE, EXTREME_TOLERANCE), "int8": (0.25, 1.05)}
-FROZEN: Final = BUNDLE_DIR / "frozen.npz"
-EXTREME: Final = "extreme"
 
 
 class Parity(NamedTuple):
@@ -73,7 +72,7 @@ def verify(path: Path, frozen: FrozenSet) -> Iterator[Parity]:
     groups: dict[str, NDArray[np.float32]] = {"test set": read_windows(frozen, contract, None)}
     if contract.takes_poses:
         groups["one tap"] = groups["test set"][:, : len(AXES)]
-    groups[EXTREME] = np.concatenate([*extreme_windows(contract).values()])
+    groups["extreme"] = np.concatenate([*extreme_windows(contract).values()])
     truth = frozen.patterns() if contract.scale == frozen.scale else None
     run = GraphRun(model)
     for name, windows in groups.items():
@@ -97,7 +96,7 @@ def judged(
     change_db = None
     if truth is not None:
         change_db = float((psnr_db(given[0], truth, full_scale) - psnr_db(expected[0], truth, full_scale)).mean())
-    bound = BOUNDS[contract.arithmetic][windows == EXTREME]
+    bound = BOUNDS[contract.arithmetic][windows == "extreme"]
     broken, largest = "", max(found, key=lambda output: found[output] / accepted(output, bound))
     if not found[largest] <= (most := accepted(largest, bound)):
         broken = f"{largest} differs by {found[largest]:.1e}, more than {most:g}"
@@ -138,8 +137,8 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with ended_by_errors("verify"):
         out: Path | None = options.out
-        report = None if out is None else Report(out.stem, out.parent, __file__, [*options.models, FROZEN])
-        frozen = load_frozen_set(FROZEN)
+        report = None if out is None else Report(out.stem, out.parent, __file__, [*options.models, FROZEN_FILE])
+        frozen = load_frozen_set(FROZEN_FILE)
         rows = [row for path in options.models for row in verify(path, frozen)]
         table: list[Row] = [
             {

@@ -55,6 +55,8 @@ class SensorGeometry:
 
 
 USPA44: Final = SensorGeometry("uSPa44", rows=4, cols=4, pitch_mm=4.7, width_mm=20.0, height_mm=20.0)
+TAXELS: Final = USPA44.taxel_count  # of the default pad
+CHANNELS: Final = len(AXES) * TAXELS
 USPA46: Final = SensorGeometry("uSPa46", rows=4, cols=6, pitch_mm=7.25, width_mm=43.5, height_mm=29.0)
 """Pad uSPa46, with an assumed outline of half a pitch beyond the outer taxels."""
 PADS: Final = (USPA44, USPA46)  # pads with a name of their own

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
+from edge.cli.demo import Scene
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
@@ -37,7 +38,6 @@ TAP_FRAMES: Final = PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES + GAP_FRAMES
 MAGNET_FRAMES, MAGNET_ALONE_FRAMES = 80, 30  # in which it comes, and leaves; for which it stays before a tap
 _TOWARDS: Final = (0.5, -0.3, 0.8)
 _MOMENT: Final = (-0.3, -0.8, 0.5)
-FOREIGN_SCENE, MAGNET_SCENE, SLIDE_SCENE = 0, 1, 2
 # Width of the long letter, which one lane of the pad covers, and its place in the object's plane, beside the taps.
 LETTER_WIDTH_MM, LETTER_Y_MM, LETTER_PX_PER_MM = 14.0, 60.0, 4.0
 FIGURE_MM: Final = 50.0  # longest side of the long letter
@@ -74,11 +74,11 @@ def demo_recording() -> dict[str, NDArray]:
     after = _noise(rng, STILL_FRAMES).round()
     parts = [still, *pressed, later[0], later[1], magnet.round(), slid, after]
     counts = rest + np.concatenate(parts)
-    scenes = [-1] * (1 + TAPS) + [FOREIGN_SCENE] * 2 + [MAGNET_SCENE, SLIDE_SCENE, -1]
+    scenes = [Scene.FREE] * (1 + TAPS) + [Scene.FOREIGN] * 2 + [Scene.MAGNET, Scene.SLIDE, Scene.FREE]
     lengths = [len(part) for part in parts]
     scene = np.repeat(scenes, lengths)
     begins = np.cumsum([0, *lengths])
-    scene[begins[-3] - GAP_FRAMES : begins[-3]] = -1
+    scene[begins[-3] - GAP_FRAMES : begins[-3]] = Scene.FREE
     end_mm = taps.indentation_mm[:, -1]
     share, number = np.zeros(len(counts)), np.zeros(len(counts), dtype=int)
     scored = slice(REST_FRAMES, REST_FRAMES + TAPS * TAP_FRAMES)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.bundled import CONTACTS
+from edge.inference.bundled import CONTACTS_FILE
 from edge.perception.gain_learning import load_contact_model
 from edge.terminal.argument_types import positive
 from firmware_bridge.pad_geometry import AXES, USPA44
@@ -49,7 +49,7 @@ def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def contact_pads(folder: Path, file: SensorFile) -> dict[str, tuple[str, Pad]]:
     """Return of each sensor of a folder how many distinct contacts it has, and its pad; DatasetError if none."""
-    model, told = load_contact_model(CONTACTS), {}
+    model, told = load_contact_model(CONTACTS_FILE), {}
     for sensor, counts in recorded_contacts(folder, file).items():
         if len(dead := np.flatnonzero((np.ptp(counts, axis=0) == 0).all(axis=0))):
             raise DatasetError(

@@ -39,7 +39,6 @@ from train.physics.sensor_noise import Nuisances
 
 UNFAMILIAR: Final = 0.005  # share of simulated contacts whose readings are said to be those of no contact
 FOREIGN: Final = 0.01  # share of earlier taps that are dropped although they belong
-_RIDGE: Final = 1e-6
 
 
 def load_trust(path: Path, validation: PressSet | None = None) -> Trust:
@@ -98,7 +97,7 @@ def fit_forward_model(presses: PressSet) -> ForwardModel:
     constants = presses.constants.astype(np.float64)
     columns = np.concatenate([inputs, *(inputs * constants[:, [number]] for number in range(len(INPUTS)))], axis=1)
     normal = columns.T @ columns
-    normal += _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
+    normal += 1e-6 * np.trace(normal) / len(normal) * np.eye(len(normal))
     weights = np.linalg.solve(normal, columns.T @ (clean / size))
     operator = weights.reshape(1 + len(INPUTS), inputs.shape[1], -1).transpose(0, 2, 1)
     left = (clean / size - columns @ weights).reshape(len(presses), len(AXES), -1)

@@ -20,10 +20,10 @@ from edge.bench.subjects import (
     error_rows,
     subjects,
 )
+from edge.bench.timing import RATE_HZ
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
-RATE_HZ: Final = 100.0
 _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
 
 

@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
@@ -23,11 +24,20 @@ from edge.pipeline.sink import Sink
 if TYPE_CHECKING:
     from edge.view.server import LiveView
 
-FREE, FOREIGN, MAGNET, SLIDE = -1, 0, 1, 2  # scenes as train/demo.py numbers them; FREE is outside of any
-_BEGINS: Final = {
-    FOREIGN: "now another surface is tapped, and then the first one again: no pattern is ever made from both",
-    MAGNET: "now a magnet comes near the free pad, and stays while it is tapped: no contact reads like that",
-    SLIDE: "now the pad slides along another object, a long letter: a map is made of its patterns",
+
+class Scene(IntEnum):
+    """Part of the demo's recording, as numbered in it."""
+
+    FREE = -1  # between the others, and while the figure is tapped
+    FOREIGN = 0
+    MAGNET = 1
+    SLIDE = 2
+
+
+_BEGINS: Final[dict[int, str]] = {
+    Scene.FOREIGN: "now another surface is tapped, and then the first one again: no pattern is ever made from both",
+    Scene.MAGNET: "now a magnet comes near the free pad, and stays while it is tapped: no contact reads like that",
+    Scene.SLIDE: "now the pad slides along another object, a long letter: a map is made of its patterns",
 }
 
 
@@ -74,7 +84,7 @@ class DemoScore:
     def add(self, result: Result) -> None:
         """Keep the result if it is the strongest of its tap."""
         key = _key(result.scan.counts)
-        self.complete |= bool(self._peaks) and self._recording.scenes.get(key, FREE) != FREE
+        self.complete |= bool(self._peaks) and self._recording.scenes.get(key, Scene.FREE) != Scene.FREE
         if self.complete or key not in self._recording.taps or result.pattern is None:
             return
         tap, indentation_mm = self._recording.taps[key]
@@ -149,7 +159,7 @@ class DemoMap(MapSink):
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Fuse the results of the slide."""
         scene = self._recording.scenes.get(_key(result.scan.counts))
-        if scene == SLIDE:
+        if scene == Scene.SLIDE:
             self._begun = True
             super().write(result, counters)
         elif scene is not None:
@@ -186,7 +196,7 @@ class Demo(Sink):
         """Begin the demo, announced to sinks that are `watching`; one that `loops` prints a part once that is over."""
         self._recording = recording = DemoRecording(demo_recording())
         self._stream, self._view, self._watching, self._commands, self._loops = stream, view, watching, commands, loops
-        self._scene = FREE
+        self._scene = Scene.FREE
         self.score = DemoScore(recording, model)
         if view is not None:
             view.show_truth(self.score.truth)
@@ -210,7 +220,7 @@ class Demo(Sink):
     def _announce(self, scene: int) -> None:
         """Announce the next scene; where the robot goes to another object and back, earlier taps are forgotten."""
         before, self._scene = self._scene, scene
-        if scene != before and SLIDE in (scene, before):
+        if scene != before and Scene.SLIDE in (scene, before):
             self._commands.put(RESET)
         if scene != before and scene in _BEGINS:
             event = Event(time.monotonic_ns(), "note", None, f"demo: {_BEGINS[scene]}")

@@ -8,19 +8,14 @@ from typing import Final, TextIO
 import numpy as np
 
 from edge.api import DEFAULT_MODEL, POSED_MODEL, Model, ModelError, bundled_models, load_model
+from edge.bench.timing import RATE_HZ
 from edge.terminal.argument_types import columns, wrapped
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.errors import DeviceError, as_typed
 from firmware_bridge.links.discovery import Found, devices
 from firmware_bridge.schedule import Ticker
 
-RATE_HZ: Final = 100.0
 TICKS: Final = 150
-NOTHING = (
-    "no adapter found: check both plugs of a VScom (the second is the sensor's power), the lines of `dmesg` since "
-    "it was plugged in, and that this user is in the group dialout"
-)
-SERVER_HINT = "The vendor's server, where one runs, is not searched for: --source xela-server:ws://HOST:5000"
 
 
 def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
@@ -72,7 +67,10 @@ def show_devices(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     listed, notes = devices()
     out.write("".join(f"{line}\n" for line in page(listed, notes, columns())))
     if not any(device.adapter for device in listed):
-        raise DeviceError(NOTHING)
+        raise DeviceError(
+            "no adapter found: check both plugs of a VScom (the second is the sensor's power), the lines of `dmesg` "
+            "since it was plugged in, and that this user is in the group dialout"
+        )
 
 
 def page(listed: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
@@ -85,6 +83,7 @@ def page(listed: Sequence[Found], notes: Sequence[str], width: int) -> list[str]
         lines.append(f"  --source {as_typed(device.source)}")
         for problem in device.problems:
             lines += wrapped(problem, width, "  ! ", "    ")
-    for note in (*notes, SERVER_HINT):
+    hint = "The vendor's server, where one runs, is not searched for: --source xela-server:ws://HOST:5000"
+    for note in (*notes, hint):
         lines += wrapped(note, width)
     return lines

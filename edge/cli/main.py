@@ -23,9 +23,9 @@ from edge.api import (
 from edge.cli.option_table import COMMAND_LIST, COMMANDS, EXAMPLES, TABLE, runtime_options
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import EXIT_USAGE, Parser
+from edge.terminal.stop_signals import STDERR, STDIN, STDOUT
 from firmware_bridge.errors import harmless
 
-STDIN, STDOUT, STDERR = 0, 1, 2
 _FIXED: Final[dict[str, dict[str, Any]]] = {
     "demo": {"source": ["demo"], "sensor": None, "id_map": None, "baseline": None, "poses": [], "give_up_s": None},
     "replay": {"source": [], "id_map": None, "give_up_s": None, "poses": []},

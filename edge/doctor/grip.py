@@ -7,12 +7,11 @@ from typing import Final
 import numpy as np
 
 from edge.doctor.findings import Finding, judged
-from edge.doctor.guided_press import Weighed
+from edge.doctor.guided_press import FREE_SCANS, Weighed
 from edge.perception.run_options import OFF_COUNTS, ON_COUNTS
 
 ASK: Final = "Let the gripper close on something firm, so that both pads press it, hold it for two seconds, and open."
 HELD_SCANS: Final = 100  # scans of each pad in the grip, before its end is waited for
-FREE_SCANS: Final = 20
 
 
 class Grip:

@@ -7,8 +7,10 @@ from typing import Final
 from edge.errors import ModelError, UsageError
 
 BUNDLE_DIR: Final = Path(__file__).resolve().parents[1] / "models"
-TAXELS: Final = BUNDLE_DIR / "taxels.npz"  # file of the estimator of dead taxels
-CONTACTS: Final = BUNDLE_DIR / "contacts.npz"  # distribution of contacts, by which a running sensor learns its gains
+TAXELS_FILE: Final = BUNDLE_DIR / "taxels.npz"  # file of the estimator of dead taxels
+CONTACTS_FILE: Final = (
+    BUNDLE_DIR / "contacts.npz"
+)  # distribution of contacts, by which a running sensor learns its gains
 DEFAULT_MODEL: Final = "stsr-int8"  # model that assumes nothing of earlier taps
 INT8_SUFFIX: Final = "-int8"
 POSED_MODEL: Final = "mtsr-int8"  # default where poses of the pad come: it combines up to 7 taps

@@ -15,15 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError
-from edge.inference.bundled import CONTACTS
+from edge.inference.bundled import CONTACTS_FILE
 from edge.perception.event import Report
 from edge.perception.result import Estimate, Step
 from edge.perception.trust_check import PatternCheck, SensorPad
-from firmware_bridge.pad_geometry import AXES, USPA44
+from firmware_bridge.pad_geometry import AXES, CHANNELS, TAXELS
 from firmware_bridge.recording.npz_recording import read_npz
-from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES, UNMEASURED_CERTAINTY, Pad
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD, LEVEL_90, PAD_RANGES, UNMEASURED_CERTAINTY, Pad
 
-TAXELS: Final = USPA44.taxel_count
 LARGEST_COUNTS: Final = (1390.0, 1390.0, 13400.0)  # of x, y, z of a contact that is used: chips clip a little above
 LEAST_COUNTS: Final = 200.0  # largest z of the weakest contact that is used: in weaker ones drift is over a fifth of it
 REMEMBERED: Final = 64  # newest contacts, of which a further one must differ: always the same contact teaches once
@@ -33,7 +32,7 @@ CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which measured 
 _OPEN: Final = 1 / np.sqrt(3)  # prior deviation of a constant over half of its range: uniform within it
 _Z: Final = slice(2 * TAXELS, 3 * TAXELS)
 # Linear parameters beside the pad's constants: inverse gains, leans of x and y, unevenness of z, and offsets.
-_LINEAR: Final = GAINS + 2 * TAXELS + TAXELS + GAINS
+_LINEAR: Final = CHANNELS + 2 * TAXELS + TAXELS + CHANNELS
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +40,15 @@ class ContactModel:
     """Distribution of contacts: k components, whose means depend on p constants of the pad."""
 
     log_shares: NDArray[np.float64]  # (k,), log share of each less half the log determinant of its covariance
-    means: NDArray[np.float64]  # (k, 1 + p, GAINS): on a middle pad, then the change by half the range of a constant
-    precisions: NDArray[np.float32]  # (k, GAINS, GAINS)
+    means: NDArray[np.float64]  # (k, 1 + p, CHANNELS): on a middle pad, then the change by half the range of a constant
+    precisions: NDArray[np.float32]  # (k, CHANNELS, CHANNELS)
     widening: float  # factor on deviations, so that 90 % intervals hold nine in ten gains of simulated sensors
-    bias: NDArray[np.float64]  # (GAINS,), mean error of the log-gains of simulated sensors after many contacts
+    bias: NDArray[np.float64]  # (CHANNELS,), mean error of the log-gains of simulated sensors after many contacts
     constants: tuple[tuple[str, float, float], ...]  # name, middle and half of the range of each of the p
     constant_widening: float  # factor on their deviations, likewise
 
 
-def load_contact_model(path: Path = CONTACTS) -> ContactModel:
+def load_contact_model(path: Path = CONTACTS_FILE) -> ContactModel:
     """Load the model that `train.learning.contact_mixture` has made, or raise an EdgeError."""
     try:
         of_contacts = ("share", "means", "factors", "widening", "bias")
@@ -59,8 +58,12 @@ def load_contact_model(path: Path = CONTACTS) -> ContactModel:
         constants = tuple(zip(names, middles, halves, strict=True))
         factors = arrays["factors"].astype(np.float64)
         count = len(factors)
-        if factors.shape != (count, GAINS, GAINS) or arrays["means"].shape != (count, 1 + len(constants), GAINS):
-            raise ValueError(f"factors are {factors.shape}, expected (k, {GAINS}, {GAINS})")
+        if factors.shape != (count, CHANNELS, CHANNELS) or arrays["means"].shape != (
+            count,
+            1 + len(constants),
+            CHANNELS,
+        ):
+            raise ValueError(f"factors are {factors.shape}, expected (k, {CHANNELS}, {CHANNELS})")
         log_size = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
         if not np.isfinite(log_size).all():
             raise ValueError("a component is singular")
@@ -73,7 +76,7 @@ def load_contact_model(path: Path = CONTACTS) -> ContactModel:
         arrays["means"].astype(np.float64),
         (factors.transpose(0, 2, 1) @ factors).astype(np.float32),
         float(arrays["widening"]),
-        arrays["bias"].astype(np.float64).reshape(GAINS),
+        arrays["bias"].astype(np.float64).reshape(CHANNELS),
         constants,
         float(arrays["constant_widening"]),
     )
@@ -89,39 +92,39 @@ class GainLearner:
         constants = model.means.shape[1] - 1
         size = _LINEAR + constants
         self._prior = _prior(constants)
-        self._unknown = np.diag(np.linalg.inv(self._prior))[:GAINS]
-        self._least_deviations = np.zeros(GAINS)
+        self._unknown = np.diag(np.linalg.inv(self._prior))[:CHANNELS]
+        self._least_deviations = np.zeros(CHANNELS)
         self._begin = np.zeros(size)
-        self._begin[:GAINS] = 1.0
-        if start is not None and start.gains is not None and len(start.gains) == GAINS:
-            self._begin[:GAINS] = 1 / np.asarray(start.gains)
+        self._begin[:CHANNELS] = 1.0
+        if start is not None and start.gains is not None and len(start.gains) == CHANNELS:
+            self._begin[:CHANNELS] = 1 / np.asarray(start.gains)
             if start.gain_half_widths is None:
-                deviation = np.full(GAINS, (1 - UNMEASURED_CERTAINTY) * GAIN_SPREAD)
+                deviation = np.full(CHANNELS, (1 - UNMEASURED_CERTAINTY) * GAIN_SPREAD)
             else:
                 deviation = np.maximum(np.asarray(start.gain_half_widths) / LEVEL_90, 1e-3)
-            self._prior[:GAINS, :GAINS] = np.diag((deviation / model.widening) ** -2.0) + _even_axes()
+            self._prior[:CHANNELS, :CHANNELS] = np.diag((deviation / model.widening) ** -2.0) + _even_axes()
             # What contacts share does not average out, so that they make no measured gain surer than this.
             self._least_deviations = np.minimum(deviation, 0.04)
         self._best = self._begin.copy() if look_from is None else look_from._best.copy()
         before = np.diag(np.linalg.inv(self._prior))
-        self._before, self._after = before[:GAINS], before[:GAINS]
-        self.deviations = model.widening * np.sqrt(before[:GAINS])  # of the log-gains
+        self._before, self._after = before[:CHANNELS], before[:CHANNELS]
+        self.deviations = model.widening * np.sqrt(before[:CHANNELS])  # of the log-gains
         self.constant_deviations = np.sqrt(before[_LINEAR:])  # over half of their ranges
         self._square = np.zeros((size, size))
         self._product = np.zeros(size)
         self._weight = self._count = 0.0
-        self._recent = np.zeros((REMEMBERED, GAINS), dtype=np.float32)
-        self._centres = np.empty((len(model.means), GAINS), dtype=np.float32)
+        self._recent = np.zeros((REMEMBERED, CHANNELS), dtype=np.float32)
+        self._centres = np.empty((len(model.means), CHANNELS), dtype=np.float32)
         self._find_centres()
 
     @property
     def gains(self) -> NDArray[np.float64]:
-        """Gains (GAINS,) so far, within BOUND of 1."""
+        """Gains (CHANNELS,) so far, within BOUND of 1."""
         # Weight of the contacts beside the beginning, over what it is where nothing is known at the beginning.
         information = (1 / self._after - 1 / self._before).clip(0)
         weight, of_unknown = ((information / (information + 1 / var)).sum() for var in (self._before, self._unknown))
         biased = self._count / (self._count + 30) * weight / max(of_unknown, 1e-9)
-        return (np.exp(-biased * self._model.bias) / self._best[:GAINS]).clip(1 - BOUND, 1 + BOUND)
+        return (np.exp(-biased * self._model.bias) / self._best[:CHANNELS]).clip(1 - BOUND, 1 + BOUND)
 
     def pad(self) -> Pad:
         """Return the gains with half widths of their 90 % intervals, and with intervals the constants that show."""
@@ -150,7 +153,7 @@ class GainLearner:
     @property
     def disagreement(self) -> float:
         """Mean square of how far contacts move the gains, over that of a right beginning; then it is about 1."""
-        moved = np.square(self._best[:GAINS] - self._begin[:GAINS])
+        moved = np.square(self._best[:CHANNELS] - self._begin[:CHANNELS])
         return float(moved.mean() / max(float((self._before - self._after).clip(0).mean()), 1e-9))
 
     def learn(self, counts: NDArray[np.floating], dead: NDArray[np.bool_] | None = None) -> bool:
@@ -158,7 +161,7 @@ class GainLearner:
 
         Weak and clipped contacts, those that resemble a recent one, and readings of dead taxels are left out.
         """
-        read = np.asarray(counts, dtype=np.float64).reshape(GAINS)
+        read = np.asarray(counts, dtype=np.float64).reshape(CHANNELS)
         peaks = np.abs(read).reshape(len(AXES), TAXELS).max(axis=1)
         if peaks[2] <= LEAST_COUNTS or (peaks >= LARGEST_COUNTS).any():
             return False
@@ -196,14 +199,14 @@ class GainLearner:
         distances = np.einsum("kc,kc->k", pulls, off)
         component = int((model.log_shares - 0.5 * distances).argmax())
         distance = float(distances[component])
-        if distance > 40 * GAINS:  # GAINS is the mean on an even sensor
+        if distance > 40 * CHANNELS:  # CHANNELS is the mean on an even sensor
             return False
         self._recent[self.contacts % REMEMBERED] = contact
         self.contacts += 1
         precision, means = model.precisions[component].astype(np.float64), model.means[component]
         if dead is not None:
             precision = _without(precision, dead)
-        weight = (_FREEDOM + GAINS) / (_FREEDOM + distance)
+        weight = (_FREEDOM + CHANNELS) / (_FREEDOM + distance)
         # The constants move what the even readings are to be like: readings less their effect are to be the first mean.
         design = np.hstack([design, -means[1:].T])
         pull = weight * design.T @ precision
@@ -217,20 +220,22 @@ class GainLearner:
         """Take one step of Newton towards the best gains; return whether they still move."""
         # Endless contacts tell no more than 150: they share what the model leaves out.
         share = 1 / (1 + self._count / 150)
-        inverse = self._best[:GAINS]
+        inverse = self._best[:CHANNELS]
         slope = share * (self._square @ self._best - self._product) + self._prior @ (self._best - self._begin)
-        slope[:GAINS] -= share * self._weight / inverse
+        slope[:CHANNELS] -= share * self._weight / inverse
         curve = share * self._square + self._prior
-        curve[np.arange(GAINS), np.arange(GAINS)] += share * self._weight / inverse**2
+        curve[np.arange(CHANNELS), np.arange(CHANNELS)] += share * self._weight / inverse**2
         covariance = np.linalg.inv(curve)
         step = -(covariance @ slope)
-        longest = float(np.abs(step[:GAINS]).max())
+        longest = float(np.abs(step[:CHANNELS]).max())
         self._best += step * min(1.0, 0.1 / max(longest, 1e-9))
-        self._best[:GAINS] = self._best[:GAINS].clip(1 / (1 + BOUND), 1 / (1 - BOUND))
+        self._best[:CHANNELS] = self._best[:CHANNELS].clip(1 / (1 + BOUND), 1 / (1 - BOUND))
         self._best[_LINEAR:] = self._best[_LINEAR:].clip(-1.2, 1.2)
         spread = np.sqrt(np.diag(covariance).clip(1e-12))
-        self._after = spread[:GAINS] ** 2
-        self.deviations = np.maximum(self._model.widening * spread[:GAINS] / self._best[:GAINS], self._least_deviations)
+        self._after = spread[:CHANNELS] ** 2
+        self.deviations = np.maximum(
+            self._model.widening * spread[:CHANNELS] / self._best[:CHANNELS], self._least_deviations
+        )
         self.constant_deviations = np.minimum(self._model.constant_widening * spread[_LINEAR:], _OPEN)
         self._find_centres()
         return longest > 1e-3
@@ -240,10 +245,10 @@ class GainLearner:
 
 
 def _design(contact: NDArray[np.float64], strength: float) -> NDArray[np.float64]:
-    """Return the matrix (GAINS, _LINEAR) that makes a contact's even readings of the linear parameters."""
+    """Return the matrix (CHANNELS, _LINEAR) that makes a contact's even readings of the linear parameters."""
     z = contact[_Z]
-    design = np.zeros((GAINS, _LINEAR))
-    blocks = (contact, -np.concatenate([z, z]), z.clip(0, 1) / strength, np.full(GAINS, 1 / strength))
+    design = np.zeros((CHANNELS, _LINEAR))
+    blocks = (contact, -np.concatenate([z, z]), z.clip(0, 1) / strength, np.full(CHANNELS, 1 / strength))
     column = 0
     for row, block in zip((0, 0, 2 * TAXELS, 0), blocks, strict=True):
         at = np.arange(len(block))
@@ -272,7 +277,7 @@ def _prior(constants: int) -> NDArray[np.float64]:
     """Return the prior precision of all parameters of a new sensor, in the order of `_design`."""
     # The seat and moment of a magnet change the gains of its three axes together.
     place = np.kron(np.ones((len(AXES), len(AXES))), 0.06**2 * np.eye(TAXELS))
-    gains = np.linalg.inv(GAIN_SPREAD**2 * np.eye(GAINS) + place) + _even_axes()
+    gains = np.linalg.inv(GAIN_SPREAD**2 * np.eye(CHANNELS) + place) + _even_axes()
     rest = np.concatenate([np.full(2 * TAXELS, 0.025), np.full(TAXELS, 30.0)])  # leans, and unevenness in counts
     # Deviations of drift in counts: of each taxel's own, and of what is common to all.
     drift = ((2.0, 18.0), (2.0, 18.0), (12.0, 45.0))

@@ -31,7 +31,10 @@ class Out(Flag):
     NPZ = auto()  # arrays that `edge-sr convert` makes of a recording
     ROS = auto()  # members of tactile_edge_sr/msg/Result
     MAP = auto()  # next to the record: in lines of JSON, in packed messages and as grids of MCAP
+    RECORD_NPZ = RECORD | NPZ
+    RECORD_ROS = RECORD | ROS
     ALL = RECORD | NPZ | ROS
+    NONE = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,25 +220,21 @@ def _poses(poses: NDArray[np.float32]) -> list[list[float]]:
     return [_rounded(row, 4) for row in poses.tolist()]
 
 
-_RECORD_NPZ: Final = Out.RECORD | Out.NPZ
-_RECORD_ROS: Final = Out.RECORD | Out.ROS
-_NONE: Final = Out(0)
 _pose_numbers: Final = attrgetter(*POSE_FIELDS)
 _POSE_PARTS: Final = tuple(f"pose_{key}" for key in POSE_FIELDS)
 _NEXT_TAP_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg")
 _next_tap_numbers: Final = attrgetter(*_NEXT_TAP_KEYS)
-_NEXT_TAP_PARTS: Final = tuple(f"next_tap_{key}" for key in _NEXT_TAP_KEYS)
 
 # Every field, in the order of the outputs but for shared memory, whose order is that of the bytes.
 # fmt: off
 FIELDS: Final = (
     Field("time_ns", _NUMBER, "scan.time_ns", "monotonic time of arrival (`CLOCK_MONOTONIC`)", byte=16),
     Field("sensor", _text(64, 256), "scan.sensor", "name of the sensor, such as its controller id",
-          out=_RECORD_NPZ, byte=184),
+          out=Out.RECORD_NPZ, byte=184),
     Field("scan", _NUMBER, "scan.number", "number of the scan, of this sensor", byte=24),
     Field("device_time_ns", _NUMBER_OR_NOT, "scan.device_ns",
           "when its last reading was on the bus, by the device's own time stamps on the same clock",
-          out=_RECORD_NPZ, byte=32),
+          out=Out.RECORD_NPZ, byte=32),
     Field("source", _one_of("device", "replay", "emulated"), "source",
           "kind of source: a robot acts on `device` alone", byte=48),
     Field("state", _one_of("zeroing", "incomplete", "idle", "contact", "dropped", "baseline_in_doubt"), "state",
@@ -252,8 +251,8 @@ FIELDS: Final = (
           byte=56),
     Field("taps_used", _SMALL, "taps_used", "taps that the pattern was made from", byte=60),
     Field("has_pattern", _IS_THERE, "pattern", "whether there is a pattern", make=_there, out=Out.NPZ, byte=64),
-    Field("has_deviation", _IS_THERE, "deviation", "whether there is a deviation", make=_there, out=_NONE, byte=68),
-    Field("has_traction", _IS_THERE, "traction", "whether there is a traction", make=_there, out=_NONE, byte=508),
+    Field("has_deviation", _IS_THERE, "deviation", "whether there is a deviation", make=_there, out=Out.NONE, byte=68),
+    Field("has_traction", _IS_THERE, "traction", "whether there is a traction", make=_there, out=Out.NONE, byte=508),
     Field("force_counts", _REAL, "force_counts", "summed z over the baseline", decimals=1, byte=104),
     Field("force_n", _REAL, "force_n",
           "the same in newtons, with `--counts-per-newton`; else the vendor's z force, where its server gives one",
@@ -268,25 +267,25 @@ FIELDS: Final = (
           "RMS error, over all pixels, that patterns of the same uncertainty had on taps not trained on",
           decimals=5, byte=152),
     Field("another_tap", _YES_OR_NO, "another_tap", "whether another tap is expected to take away 2 % of the "
-          "error; unknown where the model takes no further one", out=_RECORD_NPZ, byte=72),
+          "error; unknown where the model takes no further one", out=Out.RECORD_NPZ, byte=72),
     Field("next_tap", _REAL, "next_tap", "from the end of a tap to the next one: where to touch next, dx, dy in mm and "
           "turn in degrees from the newest tap's pad; records hold `target` too, the same pose in the object's plane; "
           "unknown without poses",
-          make=_next_tap_numbers, parts=_NEXT_TAP_PARTS, json=_next_tap),
+          make=_next_tap_numbers, parts=("next_tap_dx_mm", "next_tap_dy_mm", "next_tap_turn_deg"), json=_next_tap),
     Field("wrench", _REAL, "wrench", "force x, y, z on the pad in N, torque about x, y, z in N mm: see "
           "[Wrench](formats.md#wrench)",
           make=lambda wrench: wrench.force_n + wrench.torque_n_mm,
           parts=("force_x_n", "force_y_n", "force_z_n", "torque_x_n_mm", "torque_y_n_mm", "torque_z_n_mm"),
-          json=_wrench, out=_RECORD_NPZ, byte=512),
+          json=_wrench, out=Out.RECORD_NPZ, byte=512),
     Field("centre_of_pressure_mm", _REAL, "wrench", "from the pad's centre, x right, y down; in records part of "
           "`wrench`", make=attrgetter("centre_of_pressure_mm"),
           parts=("centre_of_pressure_x_mm", "centre_of_pressure_y_mm"), out=Out.NPZ, byte=560),
     Field("wrench_origin", _one_of("nominal", "calibrated", unknown=""), "wrench_origin",
-          "whether newtons are this sensor's own: see [Wrench](formats.md#wrench)", out=_RECORD_NPZ, byte=504),
+          "whether newtons are this sensor's own: see [Wrench](formats.md#wrench)", out=Out.RECORD_NPZ, byte=504),
     Field("shear_ratio", _REAL, "wrench", "tangential over normal force: an object slips where it reaches the "
           "coefficient of friction; needs no counts per newton", make=attrgetter("shear_ratio"), decimals=4, byte=576),
     Field("reused_from", _NUMBER_OR_NOT, "reused_from",
-          "number of the scan whose pattern this is, where nothing has changed since", out=_RECORD_NPZ, byte=40),
+          "number of the scan whose pattern this is, where nothing has changed since", out=Out.RECORD_NPZ, byte=40),
     Field("trusted", _YES_OR_NO, "trusted", "whether the pattern is to be believed: see [Trust](trust.md); unknown for "
           "a contact that is too light to check, and for models without checks", byte=592),
     # Four bytes after it are free: an earlier release had a further word there.
@@ -294,25 +293,25 @@ FIELDS: Final = (
           "why not: see [the reasons](trust.md#the-reasons)", byte=596),
     Field("taps_dropped", _SMALL_OR_NOT, "taps_dropped", "earlier taps that the pattern is made "
           "without, because they do not belong to this contact; unknown without earlier taps",
-          out=_RECORD_NPZ, byte=604),
+          out=Out.RECORD_NPZ, byte=604),
     Field("mismatch", _REAL, "mismatch", "share of the readings' energy that the pattern does not explain, weighted by "
           "noise, gains and drift", decimals=4, byte=584),
     Field("tap_mismatch", _OBJECT, "tap_mismatch", "of each earlier tap, the newest first: how little it belongs to "
           "this contact, 0 to 1; from 0.5 it is left out", json=_rounded, out=Out.RECORD),
     Field("pose", _REAL, "pose", "pose of the pad at this scan in the object's plane: place, turn from x to y, and "
           "their standard deviations; unknown without poses", make=_pose_numbers, parts=_POSE_PARTS, json=_pose,
-          out=_RECORD_ROS),
+          out=Out.RECORD_ROS),
     Field("scan_pose", _REAL, "pose", "in records `pose`: x, y in mm, turn in degrees, and their standard deviations",
           make=_pose_numbers, parts=_POSE_PARTS, out=Out.NPZ),
     Field("poses", _array("poses"), "poses", "of each tap that the pattern is made from, newest first, its pad's "
           "pose as the newest tap's pad sees it: dx, dy in mm, turn in degrees, and their standard deviations; unknown "
-          "for models that take no poses", json=_poses, out=_RECORD_NPZ),
+          "for models that take no poses", json=_poses, out=Out.RECORD_NPZ),
     Field("run_time_us", _REAL, "run_time_us", "time of the inference, of all sensors in one call; unknown where the "
           "pattern was there already", decimals=1, byte=168),
     Field("latency_us", _REAL, "latency_us", "from the read that gave the scan's last byte to the pattern",
           decimals=1, byte=176),
     Field("baseline", Kind("text", "<U16", unknown=""), "baseline", "id of the baseline", make=attrgetter("id"),
-          out=_RECORD_NPZ),
+          out=Out.RECORD_NPZ),
     Field("baseline_origin", _TEXT, "baseline", "`start-up`, `file` or `demand`; or from the "
           "recording that is played: `recording`, where its pad is free, and `unsure`, where it may hold something all "
           "the time", make=attrgetter("origin"),
@@ -324,17 +323,17 @@ FIELDS: Final = (
     Field("dead", _BITS, "dead", "dead taxels, whose readings are not used, and why: "
           "`{\"3\": \"stuck\", \"7\": \"silent\"}`, "
           "`saturated`, `far`, `unzeroed`; elsewhere bit i: taxel i. A pattern is then made without them",
-          make=_dead_bits, json=_dead_reasons, out=_RECORD_NPZ, byte=80),
+          make=_dead_bits, json=_dead_reasons, out=Out.RECORD_NPZ, byte=80),
     Field("filled", _one_of("rest", "neighbours", unknown=""), "filled",
           "what stands for the dead taxels: an estimate from their `neighbours` "
           "(`rest` only by earlier releases); unknown while no "
           "taxel is dead, or no pattern can be made",
-          out=_RECORD_NPZ, byte=76),
+          out=Out.RECORD_NPZ, byte=76),
     Field("gains_certainty", _REAL, "gains_certainty", "how certain the gains of the sensor's channels are: 1 exact, "
-          "0 as uncertain as those of a new sensor; unknown without gains", decimals=3, out=_RECORD_NPZ),
+          "0 as uncertain as those of a new sensor; unknown without gains", decimals=3, out=Out.RECORD_NPZ),
     Field("scale_error", _REAL, "scale_error", "by what share all newtons of this sensor may be off together: from "
           "its counts per newton to the farther end of their 90 % interval; unknown before it is zeroed, and where "
-          "they were given without one", decimals=3, out=_RECORD_NPZ),
+          "they were given without one", decimals=3, out=Out.RECORD_NPZ),
     Field("note", _TEXT, "note", "why there is no pattern, which reading is held, how old a reading is or may be, "
           "what is wrong with the baseline", out=Out.RECORD),
     Field("event", _TEXT, "event", "what happened before this scan: earlier taps forgotten, what came of zeroing "
@@ -345,10 +344,10 @@ FIELDS: Final = (
     Field("temperature_k", _REAL, "scan.vendor", "mean of the sensor's thermometers by the vendor's server; no such "
           "key without", make=_temperature, decimals=2, out=Out.RECORD, left_out=True),
     Field("pattern_unit", _TEXT, "pattern_unit", "unit of the pattern and its deviation", out=Out.RECORD),
-    Field("zeroed", _array("scan"), "zeroed", "counts over the baseline", out=_NONE, byte=PLACE_IN_HEADER),
+    Field("zeroed", _array("scan"), "zeroed", "counts over the baseline", out=Out.NONE, byte=PLACE_IN_HEADER),
     Field("counts", Kind("array", "<i4", unknown=-1, shape="scan"), "scan", "raw counts x, y, z, so that everything "
           "can be computed again; null in records, else -1, where a taxel gave no reading",
-          make=attrgetter("counts"), json=_readings, out=_RECORD_NPZ,
+          make=attrgetter("counts"), json=_readings, out=Out.RECORD_NPZ,
           byte=PLACE_IN_HEADER),
     Field("pattern", _array("pattern", 0.0), "pattern", "surface deformation, in `pattern_unit`", decimals=7,
           out=Out.NPZ | Out.MAP, byte=PLACE_IN_HEADER),

@@ -102,8 +102,8 @@ class TapTracker:
             self.reset()
 
 
-_HALF_PITCH_MM: Final = USPA44.pitch_mm / 2  # four taps half a pitch apart read what lies between the taxels
-_SHIFTS_MM: Final = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]) * _HALF_PITCH_MM
+HALF_PITCH_MM: Final = USPA44.pitch_mm / 2  # four taps half a pitch apart read what lies between the taxels
+_SHIFTS_MM: Final = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]) * HALF_PITCH_MM
 
 
 def next_shift_mm(places_mm: NDArray[np.floating], reach_mm: float) -> tuple[float, float] | None:
@@ -114,7 +114,7 @@ def next_shift_mm(places_mm: NDArray[np.floating], reach_mm: float) -> tuple[flo
     """
     places_mm = places_mm[np.hypot(*places_mm.T) <= reach_mm]
     distances_mm = np.hypot(*(_SHIFTS_MM[:, None] - places_mm).transpose(2, 0, 1))
-    free = (distances_mm > _HALF_PITCH_MM / 2).all(axis=1) & (distances_mm <= reach_mm).all(axis=1)
+    free = (distances_mm > HALF_PITCH_MM / 2).all(axis=1) & (distances_mm <= reach_mm).all(axis=1)
     if not free.any():
         return None
     from_middle_mm = np.hypot(*(_SHIFTS_MM - places_mm.mean(axis=0)).T)

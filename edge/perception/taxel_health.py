@@ -1,6 +1,7 @@
 """Health of a sensor's taxels, scan by scan: held readings, dead taxels, their reasons, and estimates of dead ones."""
 
 from collections.abc import Callable
+from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
@@ -38,8 +39,6 @@ LONE_COUNTS: Final = 1500.0  # size of a reading from which a lone taxel is chec
 # sphere on one taxel alone, 0.063 on simulated taps, 0.67 on real grips.
 LONE_SHARE: Final = 0.015
 REST_COUNTS: Final = 500.0  # reading below which a taxel that was far from rest is believed again
-REASONS: Final = ("silent", "saturated", "stuck", "far", "unzeroed")
-SILENT, SATURATED, STUCK, FAR, UNZEROED = range(1, 6)
 # Limits of x, y and z: twice what sensors in the field have shown, whose z only rises when pressed.
 _LOW, _HIGH = np.array([(-2800, 2800), (-2800, 2800), (-2800, 27000)], dtype=np.float32).T[:, :, None, None]
 _WORDS: Final = {
@@ -52,6 +51,16 @@ _WORDS: Final = {
 _OVERLOADED: Final = ": overloaded, too near a magnet, or broken"
 # Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of validation's pixels.
 WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
+
+
+class Fault(IntEnum):
+    """Why a taxel is dead."""
+
+    SILENT = 1
+    SATURATED = 2
+    STUCK = 3
+    FAR = 4
+    UNZEROED = 5
 
 
 Fill = Callable[[NDArray[np.float32]], NDArray[np.float32]]
@@ -86,7 +95,7 @@ class Health:
         self._baseline: Baseline | None = None
         self.sound = False  # every taxel is believed, and nothing speaks against one
         self.most_repeats = 0  # of a taxel that is believed
-        self.reasons: dict[int, str] = {}  # one of REASONS for each dead taxel, row-major from the top left
+        self.reasons: dict[int, str] = {}  # name of the Fault of each dead taxel, row-major from the top left
 
     @property
     def silent_long(self) -> NDArray[np.bool_]:
@@ -197,18 +206,18 @@ class Health:
         size = self._follow_far(zeroed)
 
         fault = np.zeros_like(self._code)
-        fault[self._unzeroed] = UNZEROED
-        fault[self._far >= FAR_SCANS] = FAR
+        fault[self._unzeroed] = Fault.UNZEROED
+        fault[self._far >= FAR_SCANS] = Fault.FAR
         frozen = self._repeats >= FROZEN_SENSOR_SCANS
-        fault[(self._still >= STUCK_SCANS) | (self._old >= FROZEN_SCANS) | frozen] = STUCK
+        fault[(self._still >= STUCK_SCANS) | (self._old >= FROZEN_SCANS) | frozen] = Fault.STUCK
         held_ns = scan.time_ns - np.maximum(self._read_ns, self._whole_ns)
         gone = (self._age > HOLD_SCANS) | (self._arrived & (self._age > 0) & (held_ns > HOLD_NS))
-        fault[gone] = SILENT
-        fault[gone & self._saturated] = SATURATED
+        fault[gone] = Fault.SILENT
+        fault[gone & self._saturated] = Fault.SATURATED
 
         good = read & scan.renewed
         if size is not None:
-            good &= (self._code != FAR) | (size < REST_COUNTS)
+            good &= (self._code != Fault.FAR) | (size < REST_COUNTS)
         self._well += good
         self._well[(fault > 0) | ~read | (self._still > 0)] = 0
         code = np.where(fault > 0, fault, np.where(self._well >= BACK_SCANS, 0, self._code)).astype(np.int8)
@@ -217,7 +226,7 @@ class Health:
             if (dead != self.dead).any():
                 self.dead = dead  # a new array, so that a change is detected by identity
             self._code = code
-            self.reasons = {int(taxel): REASONS[code.flat[taxel] - 1] for taxel in np.flatnonzero(code)}
+            self.reasons = {int(taxel): Fault(code.flat[taxel]).name.lower() for taxel in np.flatnonzero(code)}
         counting = self._age.any() or self._still.any() or self._far.any() or self._old.any()
         self.sound = not counting and not self.dead.any() and bool(self._arrived.all())
         self.most_repeats = int(np.where(self.dead, 0, self._still).max())

@@ -29,7 +29,6 @@ MOST_MISMATCH: Final = 0.8  # nine in ten of another press's patterns exceed it,
 # contacts less than 30 % off are not believed, and 34 % of those over 50 % off.
 MOST_DOUBT: Final = 0.61
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
-SUSPECTED: Final = "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
 
 
 class SensorPad:
@@ -196,7 +195,8 @@ class PatternCheck:
             suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
             if suspected != self.suspected:
                 self.suspected = suspected
-                self._report("suspected" if suspected else "cleared", SUSPECTED if suspected else "")
+                text = "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
+                self._report(*(("suspected", text) if suspected else ("cleared", "")))
         self._tap, self._strongest = tap, -math.inf
 
 

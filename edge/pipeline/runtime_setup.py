@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge.errors import UsageError
-from edge.inference.bundled import TAXELS, find_model, taps_of
+from edge.inference.bundled import TAXELS_FILE, find_model, taps_of
 from edge.inference.contract import Model
 from edge.perception.gain_learning import load_contact_model
 from edge.perception.result import Result
@@ -23,11 +23,11 @@ from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped, with_recorded
 from edge.validation import check_kind, check_positive
 from firmware_bridge.links.registry import recording_paths
-from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44, pad_of
-from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track, check_raw
+from firmware_bridge.pad_geometry import AXES, CHANNELS, MOST_TAXELS, TAXELS, USPA44, pad_of
+from firmware_bridge.recording.tracks import Recording, Track, check_raw
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import GAINS, Pad
-from firmware_bridge.scans.scan import ABSENT
+from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.scans.scan import ABSENT, HIGHEST_COUNT
 from firmware_bridge.sensor_file.model import SensorEntry
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -67,7 +67,7 @@ def open_runtime(
     return Runtime(
         load_model(model) if isinstance(model, (str, Path)) else model,
         source=source.kind,
-        estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)) if nominal else None,
+        estimator=load_estimator(TAXELS_FILE, (USPA44.rows, USPA44.cols)) if nominal else None,
         contacts=load_contact_model() if nominal and chosen.learn else None,
         geometry=sensor_file.geometry,
         baselines=of_single_csv(stored_baselines(baselines, sensor_file), source.name),
@@ -166,9 +166,9 @@ def _checked(name: str, counts: Any, *, lowest: int) -> NDArray[Any]:
         raise UsageError(f"{name} are of type {array.dtype}, expected whole numbers: raw counts, nothing subtracted")
     if not np.isfinite(array).all():
         raise UsageError(f"{name} hold NaN or infinity, expected raw counts: -1 where a taxel gave no reading")
-    if array.ndim in (1, 2) and array.shape[-1] == GAINS:
-        array = array.reshape(-1, GAINS // len(AXES), len(AXES))
-    if array.ndim in (2, 3) and array.shape[-2:] == (GAINS // len(AXES), len(AXES)):
+    if array.ndim in (1, 2) and array.shape[-1] == CHANNELS:
+        array = array.reshape(-1, TAXELS, len(AXES))
+    if array.ndim in (2, 3) and array.shape[-2:] == (TAXELS, len(AXES)):
         vendors = array.reshape(-1, USPA44.rows, USPA44.cols, len(AXES))
         array = np.moveaxis(vendors, -1, 1)
     expected = (

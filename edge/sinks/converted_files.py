@@ -32,7 +32,6 @@ from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
 
-RESULTS_FORMAT: Final = "tactile-results"
 KINDS: Final[Mapping[str, tuple[str, Any]]] = {
     **{field.name: (field.kind.array, field.kind.unknown) for field in FIELDS if Out.NPZ in field.out},
     "origin": ("<U8", ""),
@@ -58,7 +57,7 @@ def write_npz(path: Path, recording: Recording) -> None:
             columns.add(row)
         texts = {name: mounting_text(mounting) for name, mounting in recording.mountings.items()}
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            _add(archive, "format", np.asarray(RESULTS_FORMAT))
+            _add(archive, "format", np.asarray("tactile-results"))
             _add(archive, "mountings", np.asarray(json.dumps(texts)))
             columns.add_to(archive)
             for name, array in _pose_arrays(recording.poses).items():

@@ -139,7 +139,6 @@ def pack(header: Mapping[str, Any], maps: Mapping[str, NDArray[np.floating]]) ->
 
 
 PIPE_BYTES: Final = 1 << 20  # most that Linux gives to any user
-_ON_A_LINE: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 _BEGINNING: Final = b'{"time_ns":'  # of every record: a recording, or a sensor file, must not become one by a slip
 
 
@@ -192,7 +191,7 @@ class JsonLinesSink(Sink):
         self._write(event_record(event, {**counters, "unwritten": self.unwritten}, self._source))
 
     def _write(self, fields: Mapping[str, Any]) -> None:
-        line = orjson.dumps(fields, option=_ON_A_LINE)
+        line = orjson.dumps(fields, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
         while self._may_be_full and not has_room(self._file.fileno(), len(line)):
             # In the pause less comes in than a pipe holds.
             if not self._waits or self._stop.wait(0.002):

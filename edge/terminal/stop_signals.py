@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any, Final
 
 END_S: Final = 5.0  # time from the signal to the end by force
-STDERR = 2
+STDIN, STDOUT, STDERR = 0, 1, 2
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ Source: Linux drivers/net/can/usb/gs_usb.c; candleLight_fw include/gs_usb.h.
 """
 
 import struct
+from enum import IntEnum
 from typing import Final, NamedTuple
 
 from firmware_bridge.can.slcan import CanFrame
@@ -20,10 +21,6 @@ BITRATE_BIT_S: Final = 1_000_000
 
 REQUEST_OUT: Final = 0x41
 REQUEST_IN: Final = 0xC1
-HOST_FORMAT: Final = 0
-BIT_TIMING: Final = 1
-MODE: Final = 2
-BIT_TIMING_LIMITS: Final = 4
 LIMITS_BYTES: Final = 40
 
 HARDWARE_STAMPS: Final = 1 << 4
@@ -46,6 +43,15 @@ _SAMPLE_POINTS: Final = (0.75, 0.90)  # within which a bus of usual length works
 _header = struct.Struct("<IIBBBB")
 _frame = struct.Struct("<IIBBBB8s")
 _stamp = struct.Struct("<I")
+
+
+class Request(IntEnum):
+    """Numbers of the adapter's control requests."""
+
+    HOST_FORMAT = 0
+    BIT_TIMING = 1
+    MODE = 2
+    BIT_TIMING_LIMITS = 4
 
 
 class BitTimingLimits(NamedTuple):

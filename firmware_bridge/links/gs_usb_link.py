@@ -153,19 +153,19 @@ class GsUsbLink(FrameLink):
         self._packet = array.array("B", bytes(packet_bytes or 64))
 
     def _start(self, device: usb.core.Device) -> None:
-        _request(device, gs_usb.HOST_FORMAT, gs_usb.host_format())
+        _request(device, gs_usb.Request.HOST_FORMAT, gs_usb.host_format())
         self._stop(device)
-        limits = gs_usb.BitTimingLimits.from_bytes(_ask(device, gs_usb.BIT_TIMING_LIMITS, gs_usb.LIMITS_BYTES))
-        _request(device, gs_usb.BIT_TIMING, gs_usb.bit_timing(limits).to_bytes())
+        limits = gs_usb.BitTimingLimits.from_bytes(_ask(device, gs_usb.Request.BIT_TIMING_LIMITS, gs_usb.LIMITS_BYTES))
+        _request(device, gs_usb.Request.BIT_TIMING, gs_usb.bit_timing(limits).to_bytes())
         features = limits.features & gs_usb.HARDWARE_STAMPS
         self._scans.start(stamped=features != 0)
         self._unread.empty_ns = self._clock_ns()  # from here on: this thread may not run for long after the start
-        _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
+        _request(device, gs_usb.Request.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):
             device.write(0x02, gs_usb.encode_frame(frame, number), REQUEST_TIMEOUT_MS)
 
     def _stop(self, device: usb.core.Device) -> None:
-        _request(device, gs_usb.MODE, gs_usb.mode(started=False))
+        _request(device, gs_usb.Request.MODE, gs_usb.mode(started=False))
         with suppress(usb.core.USBTimeoutError):
             for _ in range(MOST_OLD_TRANSFERS):  # frames left in the adapter follow each other within 20 ms
                 device.read(ENDPOINT_IN, self._packet, 20)

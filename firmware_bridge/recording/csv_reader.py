@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from firmware_bridge.errors import RecordingError, harmless
 from firmware_bridge.pad_geometry import AXES, PADS, USPA44, SensorGeometry
 from firmware_bridge.poses import PadPose, TimedPose
-from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, check_raw, is_rate
-from firmware_bridge.scans.scan import VendorReading
+from firmware_bridge.recording.tracks import A_RATE, Recording, Track, check_raw, is_rate
+from firmware_bridge.scans.scan import HIGHEST_COUNT, VendorReading
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
 
 CSV_POSES: Final = ("pose_x_mm", "pose_y_mm", "pose_turn_deg")

@@ -22,7 +22,6 @@ from firmware_bridge.errors import CdrError, NpzError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
 from firmware_bridge.poses import POSE_FIELDS, TimedPose
 from firmware_bridge.recording.tracks import (
-    HIGHEST_COUNT,
     MOST_POSES,
     MOST_SENSORS,
     Recording,
@@ -31,7 +30,7 @@ from firmware_bridge.recording.tracks import (
     checked_pose,
     origin_of,
 )
-from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
+from firmware_bridge.scans.scan import ABSENT, HIGHEST_COUNT, LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.schedule import LAST_TIME_NS
 
 LONGEST_READ_BYTES: Final = 1 << 20

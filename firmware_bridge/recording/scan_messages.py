@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
 from firmware_bridge.poses import POSE_FIELDS, TimedPose
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
-from firmware_bridge.recording.tracks import HIGHEST_COUNT, check, check_times, checked_pose
-from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name
+from firmware_bridge.recording.tracks import check, check_times, checked_pose
+from firmware_bridge.scans.scan import ABSENT, HIGHEST_COUNT, Scan, VendorReading, is_sensor_name
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS, HIGHEST_UPS_HZ, KELVIN
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline, Origin

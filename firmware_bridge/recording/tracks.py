@@ -19,7 +19,6 @@ from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 if TYPE_CHECKING:
     from firmware_bridge.zeroing.baseline import Baseline
 
-HIGHEST_COUNT: Final = 0xFFFF
 MOST_SENSORS: Final = 64  # most sensors of a recording; one wire can have sixteen
 MOST_POSES: Final = 1 << 23  # most poses of a recording: those of a day at 100 Hz, in 3 GB
 RATES_HZ: Final = (1e-3, 1e5)  # lowest and highest rate, in [Hz]: beyond them periods in [ns] overflow, or become 0

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44
+from firmware_bridge.pad_geometry import AXES, CHANNELS, MOST_TAXELS, USPA44
 from firmware_bridge.scans.mounting import Mounting
 
 PAD_RANGES: Final = MappingProxyType(
@@ -28,7 +28,6 @@ PAD_RANGES: Final = MappingProxyType(
 )
 """Constants of a pad, in this order, and their ranges: wider than for any pad, so that only slips are refused."""
 GAIN_RANGE: Final = (0.01, 100.0)
-GAINS: Final = len(AXES) * USPA44.taxel_count  # number of gains of the default pad
 GAIN_SPREAD: Final = 0.075  # standard deviation of a chip's gain on one axis over new sensors: +-15 % are seen
 LEVEL_90: Final = 1.645  # half width of a normal 90 % interval, in standard deviations
 UNMEASURED_CERTAINTY: Final = 0.9  # of gains without intervals: a person has measured them somehow
@@ -68,7 +67,7 @@ class Pad:
             len(self.gains) not in range(len(AXES), len(AXES) * MOST_TAXELS + 1, len(AXES))
             or not all(low <= gain <= high for gain in self.gains)
         ):
-            expected = f"{len(AXES)} numbers a taxel, {GAINS} of a {USPA44.name}, from {low:g} to {high:g}"
+            expected = f"{len(AXES)} numbers a taxel, {CHANNELS} of a {USPA44.name}, from {low:g} to {high:g}"
             raise ValueError(f"gains are {list(self.gains)}, expected {expected}")
         widths = self.gain_half_widths
         if widths is not None and (

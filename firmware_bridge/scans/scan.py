@@ -10,6 +10,7 @@ from firmware_bridge.pad_geometry import SensorGeometry
 
 SCANS_COUNTED: Final = ("scans", "torn_wire", "torn_source", "repeated", "missing_taxels")
 ABSENT: Final = -1  # marker of a taxel without a reading in this scan; raw counts are unsigned, so no reading is -1
+HIGHEST_COUNT: Final = 0xFFFF
 LONGEST_SENSOR_NAME: Final = 64
 
 

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
+from firmware_bridge.scans.scan import HIGHEST_COUNT
 
-HIGHEST_COUNT: Final = 0xFFFF
 LONGEST_MESSAGE_BYTES: Final = 1 << 18  # most bytes of a message: sixteen sensors with every field take a third of it
 MOST_SENSORS: Final = 16
 HIGHEST_UPS_HZ: Final = 10_000.0

@@ -26,7 +26,6 @@ from firmware_bridge.sensor_file.model import (
     load_sensor_file,
 )
 
-_EMULATED: Final = "measured on an emulated sensor: not for a device"
 LOCKED_S: Final = 5.0  # longest wait for another program that changes the file, in [s]: changing it takes milliseconds
 
 
@@ -109,7 +108,11 @@ def _tables(entry: SensorEntry, shape: tuple[int, int, int]) -> dict[str, list[s
         *_line("counts_per_newton", entry.counts_per_newton, "of the summed z"),
         *_line("counts_per_newton_interval", entry.counts_per_newton_interval, "90 %"),
         *_line("assumed", sorted(entry.assumed, key=PARTS.index) or None, "as wired; not measured"),
-        *_line("emulated", sorted(entry.emulated, key=PARTS.index) or None, _EMULATED),
+        *_line(
+            "emulated",
+            sorted(entry.emulated, key=PARTS.index) or None,
+            "measured on an emulated sensor: not for a device",
+        ),
     ]
     tables = {"": own}
     if frame is not None:

@@ -21,12 +21,13 @@ from edge.errors import ModelError, WindowError
 from edge.inference.onnx_session import ModelSession
 from edge.perception.run_options import RuntimeOptions
 from edge.perception.runtime import Runtime
+from firmware_bridge.pad_geometry import CHANNELS
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import GAINS, LEVEL_90, Pad
+from firmware_bridge.scans.pad_constants import LEVEL_90, Pad
 
-GAINED = tuple(np.linspace(0.5, 2, GAINS).tolist())
+GAINED = tuple(np.linspace(0.5, 2, CHANNELS).tolist())
 PAD = Pad(thickness_mm=5.0, gains=GAINED)
-MEASURED = replace(PAD, gain_half_widths=(0.02 * LEVEL_90,) * GAINS)
+MEASURED = replace(PAD, gain_half_widths=(0.02 * LEVEL_90,) * CHANNELS)
 OTHER = Pad(thickness_mm=4.0, counts_per_newton=2000.0)
 
 
@@ -45,8 +46,8 @@ def row(*numbers):
         (Pad(poisson=0.4), row(0, 0, 0, 0, 0)),
         (PAD, row(1, 0, 1, 0, 0.9)),
         (MEASURED, row(1, 0, 1, 0, 1 - 0.02 / 0.075)),
-        (replace(PAD, gain_half_widths=(0.0,) * GAINS), row(1, 0, 1, 0, 1)),
-        (replace(PAD, gain_half_widths=(0.5,) * GAINS), row(1, 0, 1, 0, 0)),
+        (replace(PAD, gain_half_widths=(0.0,) * CHANNELS), row(1, 0, 1, 0, 1)),
+        (replace(PAD, gain_half_widths=(0.5,) * CHANNELS), row(1, 0, 1, 0, 0)),
         (replace(OTHER, intervals={"thickness_mm": (3.8, 4.2)}), row(-1, 2, 1, 1, 0)),
         (replace(OTHER, intervals={"thickness_mm": (3.0, 5.0)}), row(0, 2, 0, 1, 0)),
         (Pad(counts_per_newton=1000.0), row(0, 0, 0, 1, 0)),

@@ -26,8 +26,9 @@ from edge.inference.bundled import demo_recording, find_model
 from edge.pipeline.gain_keeper import keep_learned
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
+from firmware_bridge.pad_geometry import CHANNELS
 from firmware_bridge.recording.tracks import Recording, Track
-from firmware_bridge.scans.pad_constants import GAINS, Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import save_baselines
@@ -183,7 +184,7 @@ def world(emulated, press, tmp_path, plugged, monkeypatch):
         if " doctor " in command and "--out" in command and "--sensor" not in command:
             Path("sensor.toml").unlink()
         if "--forget-gains" in command:
-            keep_learned(Path("sensor.toml"), "4", Pad(gains=(1.0,) * GAINS))
+            keep_learned(Path("sensor.toml"), "4", Pad(gains=(1.0,) * CHANNELS))
         if " convert " in command:
             Path("press.npz").rename("old.npz")
         for written, real in (

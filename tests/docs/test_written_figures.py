@@ -18,8 +18,9 @@ from edge.inference.bundled import demo_recording, find_model
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.perception.result import REASON_TEXTS
 from edge.sinks.json_records import CHOICES, PROGRESS
+from firmware_bridge.pad_geometry import CHANNELS
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import GAINS, PAD_RANGES, Pad
+from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import save_baselines
@@ -100,7 +101,9 @@ def test_keys_of_baseline_and_sensor_files(tmp_path):
     assert set(document) == {"format", "version", "baselines"}
     assert set(document["baselines"][0]) == told("Baseline file")
     constants = {name: low or high for name, (low, high) in PAD_RANGES.items()}
-    pad = Pad(**constants, intervals={"thickness_mm": (0.1, 5)}, gains=(1.0,) * GAINS, gain_half_widths=(0.1,) * GAINS)
+    pad = Pad(
+        **constants, intervals={"thickness_mm": (0.1, 5)}, gains=(1.0,) * CHANNELS, gain_half_widths=(0.1,) * CHANNELS
+    )
     marks = {"assumed": frozenset({"mounting"}), "emulated": frozenset({"force"})}
     marks |= {"counts_per_newton_interval": (1100.0, 1260.0)}
     sensors = {"4": SensorEntry(Mounting(swap_xy=True), 1180.0, baseline, pad, pad, **marks)}

@@ -31,8 +31,7 @@ from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import baseline_type, encode_baseline, encode_scan, scan_type
-from firmware_bridge.recording.tracks import HIGHEST_COUNT
-from firmware_bridge.scans.scan import ABSENT, Scan
+from firmware_bridge.scans.scan import ABSENT, HIGHEST_COUNT, Scan
 from firmware_bridge.sensor_file.model import load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines

@@ -11,7 +11,7 @@ from trust_samples import make_posed_trust
 
 from edge.api import POSED_MODEL, USPA44, Commands, Runtime, Source, demo_recording, load_model
 from edge.cli import run_command
-from edge.cli.demo import SLIDE, Demo
+from edge.cli.demo import Demo, Scene
 from edge.cli.main import parsed_options
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.perception.run_options import RuntimeOptions
@@ -31,7 +31,7 @@ def play(demo, lost=()):
     model, sink = FakeModel(), ListSink()
     shown = Demo(model, io.StringIO(), None, [sink], Commands(), loops=False, maps=False)
     runtime, series = Runtime(model, source="emulated"), ScanSeries("4", USPA44)
-    for n, counts in enumerate(demo["counts"][: np.argmax(demo["scene"] == SLIDE) + 1]):
+    for n, counts in enumerate(demo["counts"][: np.argmax(demo["scene"] == Scene.SLIDE) + 1]):
         if n not in lost:
             shown.write(runtime.push(series.close(counts.copy(), n * 10_000_000)), {})
     assert shown.score.complete
@@ -61,7 +61,7 @@ def test_each_tap_is_scored_at_its_peak_by_that_frames_truth(demo):
 def test_the_bundled_model_drops_foreign_taps_and_flags_a_magnet(demo):
     runtime = Runtime(load_model(POSED_MODEL), source="emulated", options=RuntimeOptions(every_scan=True))
     series = ScanSeries("4", USPA44)
-    before = np.argmax(demo["scene"] == SLIDE)
+    before = np.argmax(demo["scene"] == Scene.SLIDE)
     counts, tap, scene = (demo[name][:before] for name in ("counts", "tap", "scene"))
     stated, results = [*load_recording(demo_recording()).poses], []
     for n, one in enumerate(counts):

@@ -9,7 +9,6 @@ import pytest
 from link_rigs import make_network
 
 from edge.cli import main as cli
-from edge.cli.listings import NOTHING, SERVER_HINT
 from edge.pipeline.run_statistics import silence_hint
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import discovery as devices
@@ -18,6 +17,8 @@ from firmware_bridge.links.discovery import can_interfaces, serial_devices
 from firmware_bridge.links.gs_usb_link import GsUsbDevice
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.scans.slcan_scans import SlcanScans
+
+HINT = "The vendor's server, where one runs, is not searched for: --source xela-server:ws://HOST:5000"
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus", "USB-CAN Plus", "VScom")
 GRIPPER = Port("/dev/ttyUSB1", (0x0403, 0x6015), "GRIP1", "FT231X USB UART", "FT231X USB UART", "FTDI")
@@ -71,8 +72,8 @@ def test_everything_is_listed_adapters_first(plugged, gs_usb, capsys):
     plugged[:] = [BUILT_IN]
     assert cli.main(["devices"]) == 3
     out, err = capsys.readouterr()
-    assert err == f"edge-sr: {NOTHING}\n" and "both plugs" in NOTHING and "dmesg" in NOTHING and "dialout" in NOTHING
-    assert out.splitlines()[0] == "/dev/ttyS0" and out.splitlines()[-1] == SERVER_HINT
+    assert err.startswith("edge-sr: no adapter found") and "both plugs" in err and "dmesg" in err and "dialout" in err
+    assert out.splitlines()[0] == "/dev/ttyS0" and out.splitlines()[-1] == HINT
     plugged[:] = [BUILT_IN, GRIPPER, VSCOM._replace(path="/dev/ttyUSB9")]
     gs_usb[:] = [
         GsUsbDevice(1, 4, (0x1D50, 0x606F), "004B", "candleLight"),
@@ -87,7 +88,7 @@ def test_everything_is_listed_adapters_first(plugged, gs_usb, capsys):
         *("/dev/ttyUSB9  0403:6015  serial D30BL366", "bus 1 device 4  1d50:606f  serial 004B"),
         *("bus 1 device 5  1d50:606f", "bus 2 device 4 at 2-1.4  1d50:606f  serial 0001"),
         *("bus 2 device 5 at 2-3  1d50:606f  serial 0001", "/dev/ttyS0", "/dev/ttyUSB1  0403:6015  serial GRIP1"),
-        SERVER_HINT,
+        HINT,
     ]
     assert "  looks like VScom USB-CAN Plus\n  --source slcan:serial=D30BL366\n" in out
     assert "  FT231X USB UART by FTDI: no known adapter\n  --source slcan:serial=GRIP1\n" in out
@@ -102,7 +103,7 @@ def test_usb_that_cannot_be_read_hides_no_port(plugged, gs_usb, capsys, monkeypa
     monkeypatch.setattr(gs_usb_link, "gs_usb_devices", fail)
     plugged[:] = [VSCOM]
     assert cli.main(["devices"]) == 0
-    assert capsys.readouterr().out.splitlines()[-2:] == [why, SERVER_HINT]
+    assert capsys.readouterr().out.splitlines()[-2:] == [why, HINT]
 
 
 def counted(said):

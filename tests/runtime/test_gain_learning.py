@@ -13,7 +13,7 @@ from trust_samples import make_trust
 
 from edge.api import USPA44, EdgeError, SensorFileError, Source, Stream
 from edge.cli import main as cli
-from edge.inference.bundled import CONTACTS
+from edge.inference.bundled import CONTACTS_FILE
 from edge.perception.gain_learning import (
     BOUND,
     CONTRADICTED_CONTACTS,
@@ -25,7 +25,8 @@ from edge.perception.gain_learning import (
 from edge.perception.run_options import RuntimeOptions
 from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
-from firmware_bridge.scans.pad_constants import GAINS, Pad
+from firmware_bridge.pad_geometry import CHANNELS
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -38,16 +39,18 @@ FREE = np.zeros((3, 4, 4))
 def make_model(seed=0):
     """Return a model of three kinds of contacts on pads that are all alike, and what draws from each kind."""
     rng, kinds = np.random.default_rng(seed), 3
-    means = np.zeros((kinds, 2, GAINS))
-    means[:, 0] = rng.normal(0, 0.3, (kinds, GAINS))
+    means = np.zeros((kinds, 2, CHANNELS))
+    means[:, 0] = rng.normal(0, 0.3, (kinds, CHANNELS))
     means[:, 0, Z] = 1 + rng.normal(0, 0.25, (kinds, 16))
     means[:, 0, Z] /= np.sqrt(np.square(means[:, 0, Z]).mean(axis=1, keepdims=True))
-    mixing = rng.normal(0, 0.08, (kinds, GAINS, 4))
-    covariances = mixing @ mixing.transpose(0, 2, 1) + 1e-3 * np.eye(GAINS)
+    mixing = rng.normal(0, 0.08, (kinds, CHANNELS, 4))
+    covariances = mixing @ mixing.transpose(0, 2, 1) + 1e-3 * np.eye(CHANNELS)
     logs = -0.5 * np.linalg.slogdet(covariances)[1] - np.log(kinds)
     precisions = np.linalg.inv(covariances).astype(np.float32)
     constants = (("poisson", 0.445, 0.045),)
-    return ContactModel(logs, means, precisions, 1.0, np.zeros(GAINS), constants, 1.0), np.linalg.cholesky(covariances)
+    return ContactModel(logs, means, precisions, 1.0, np.zeros(CHANNELS), constants, 1.0), np.linalg.cholesky(
+        covariances
+    )
 
 
 MODEL, ROOTS = make_model()
@@ -57,9 +60,9 @@ def draw_contacts(count, gains=None, seed=1):
     """Return contacts (count, 3, 4, 4) in counts as a sensor of these gains reads them."""
     rng = np.random.default_rng(seed)
     kinds = rng.integers(len(ROOTS), size=count)
-    drawn = MODEL.means[kinds, 0] + (ROOTS[kinds] @ rng.normal(size=(count, GAINS, 1)))[:, :, 0]
+    drawn = MODEL.means[kinds, 0] + (ROOTS[kinds] @ rng.normal(size=(count, CHANNELS, 1)))[:, :, 0]
     drawn /= np.sqrt(np.square(drawn[:, Z]).mean(axis=1, keepdims=True))
-    gains = np.ones(GAINS) if gains is None else gains
+    gains = np.ones(CHANNELS) if gains is None else gains
     return (drawn * gains * rng.uniform(500, 900, (count, 1))).reshape(count, 3, 4, 4).astype(np.float32)
 
 
@@ -124,7 +127,7 @@ class TestLearner:
 
     def test_it_begins_at_measured_gains_and_stays_there(self):
         gains = draw_gains()
-        start = Pad(gains=tuple(gains.tolist()), gain_half_widths=(0.02,) * GAINS)
+        start = Pad(gains=tuple(gains.tolist()), gain_half_widths=(0.02,) * CHANNELS)
         learner = GainLearner(MODEL, start)
         np.testing.assert_allclose(learner.gains, gains)
         assert learner.pad().gains_certainty == pytest.approx(start.gains_certainty, abs=0.02)
@@ -133,8 +136,8 @@ class TestLearner:
         assert learner.pad().gains_certainty == pytest.approx(start.gains_certainty, abs=1e-4), "and no surer"
 
     def test_the_bundled_model_is_read_and_another_file_named(self, tmp_path):
-        model = load_contact_model(CONTACTS)
-        assert len(model.means) >= 24 and CONTACTS.stat().st_size < 400_000
+        model = load_contact_model(CONTACTS_FILE)
+        assert len(model.means) >= 24 and CONTACTS_FILE.stat().st_size < 400_000
         np.testing.assert_allclose(GainLearner(model).gains, 1)
         np.savez(tmp_path / "c.npz", share=np.zeros(3))
         with pytest.raises(EdgeError, match=r"c\.npz cannot be read .*train\.learning\.contact_mixture"):
@@ -157,7 +160,7 @@ class TestStage:
         [(9, 60, True), (2, 60, False), (9, CONTRADICTED_CONTACTS - 1, False)],
     )
     def test_gains_of_another_sensor_are_contradicted_once(self, seed_in_file, count, contradicted):
-        file = Pad(gains=tuple(draw_gains(seed_in_file)), gain_half_widths=(0.03,) * GAINS)
+        file = Pad(gains=tuple(draw_gains(seed_in_file)), gain_half_widths=(0.03,) * CHANNELS)
         check = PatternCheck(make_trust(), make_pad_contract())
         learn, _, events = learning_of(file, file, check)
         for contact in draw_contacts(count, draw_gains()):
@@ -209,8 +212,8 @@ def test_learned_gains_come_into_use_with_an_event(learn):
     assert model.pads[-1][-1] == pytest.approx(results[-1].gains_certainty) and model.pads[0][-1] == 0
 
 
-LEARNED = Pad(gains=tuple(draw_gains().round(4).tolist()), gain_half_widths=(0.05,) * GAINS)
-SURER = replace(LEARNED, gain_half_widths=(0.03,) * GAINS)
+LEARNED = Pad(gains=tuple(draw_gains().round(4).tolist()), gain_half_widths=(0.05,) * CHANNELS)
+SURER = replace(LEARNED, gain_half_widths=(0.03,) * CHANNELS)
 
 
 class TestKeeping:

@@ -10,7 +10,7 @@ from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, ma
 from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.api import USPA44, Baseline, EdgeError, demo_recording
-from edge.inference.bundled import TAXELS
+from edge.inference.bundled import TAXELS_FILE
 from edge.perception import taxel_health as health
 from edge.perception.taxel_health import (
     BACK_SCANS,
@@ -27,7 +27,7 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
 
-ESTIMATOR = load_estimator(TAXELS, (4, 4))
+ESTIMATOR = load_estimator(TAXELS_FILE, (4, 4))
 
 
 class Pad:

@@ -19,7 +19,7 @@ from edge.perception.trust_check import (
     SensorPad,
     TrustVerdict,
 )
-from firmware_bridge.scans.pad_constants import GAINS
+from firmware_bridge.pad_geometry import CHANNELS
 
 CONTRACT = make_trusted_contract()
 PAD_ROW = CONTRACT.pad_row(None)
@@ -111,7 +111,7 @@ class TestReasons:
     def test_gains_that_are_certain_leave_less_unexplained(self):
         tap = make_tap()
         tap[2, 1, 1] *= 1.2
-        exact = Pad(gains=(1.0,) * GAINS, gain_half_widths=(0.0,) * GAINS)
+        exact = Pad(gains=(1.0,) * CHANNELS, gain_half_widths=(0.0,) * CHANNELS)
         certain, unsure = make_check(pad=exact), make_check()
         pattern = np.kron(make_tap()[2], np.ones((10, 10), dtype=np.float32))
         traction = np.zeros((3, 8, 8), dtype=np.float32)

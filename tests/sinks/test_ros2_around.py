@@ -30,7 +30,7 @@ from edge.sinks.registry import check_sink
 from edge.sinks.ros2 import map_messages
 from edge.sinks.ros2 import messages as ros_messages
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
-from edge.sinks.ros2.diagnostics import ERROR, OK, STALE, WARN
+from edge.sinks.ros2.diagnostics import Level
 from edge.sinks.ros2.messages import base_topic, sensor_path
 from edge.sinks.ros2.sink import Ros2Sink
 from firmware_bridge.errors import CdrError
@@ -64,26 +64,28 @@ def test_diagnostics_come_once_a_second_and_say_why_it_is_silent():
         published.clear()
         return [(status["level"], status["message"]) for status in taken]
 
-    assert written() == [(WARN, "2 dropped")]
+    assert written() == [(Level.WARN, "2 dropped")]
     clock.now_ns += 990_000_000
     sink.write(replace(idle, scan=replace(idle.scan, time_ns=clock.now_ns)), {"dropped": 2})
     assert statuses() == []
-    assert written() == [(OK, "idle")]
+    assert written() == [(Level.OK, "idle")]
     sink.tell(Event(clock.now_ns, "trouble", None, "bus-off"), {"dropped": 2})
     clock.now_ns += 1_500_000_000
     sink.wait()
     sink.wait()
-    assert statuses() == [(STALE, "no scan for 2 s; bus-off")]
+    assert statuses() == [(Level.STALE, "no scan for 2 s; bus-off")]
     sink.tell(Event(clock.now_ns, "well", None, "well again"), {"dropped": 2})
     sink.tell(Event(clock.now_ns, "silent", "5", "another is silent"), {"dropped": 2})
-    assert written(dead={3: "stuck"}) == [(WARN, "without taxel 3 (stuck)")]
+    assert written(dead={3: "stuck"}) == [(Level.WARN, "without taxel 3 (stuck)")]
     ((level, text),) = written(state="contact", trusted=False, untrusted_reason="unexplained")
-    assert level == WARN and text.startswith("pattern not to be believed: the pattern does not explain its readings")
+    assert level == Level.WARN and text.startswith(
+        "pattern not to be believed: the pattern does not explain its readings"
+    )
     doubt = {"state": "baseline_in_doubt", "contact": None, "notes": (Note("baseline_in_doubt", "why"),)}
-    assert written(**doubt) == [(ERROR, "why")]
+    assert written(**doubt) == [(Level.ERROR, "why")]
     sink.tell(Event(clock.now_ns, "lost", None, "the plug is out"), {})
     sink.close()
-    assert statuses()[-1] == (STALE, "ended")
+    assert statuses()[-1] == (Level.STALE, "ended")
 
 
 def stamps_ns(published):

@@ -66,14 +66,14 @@ class GsUsbAdapter:
 
     def request_out(self, number: int, payload: bytes) -> None:
         """Obey a request, or stall if it knows none such, or the payload is too short."""
-        lengths = {gs_usb.HOST_FORMAT: 4, gs_usb.BIT_TIMING: 20, gs_usb.MODE: 8}
+        lengths: dict[int, int] = {gs_usb.Request.HOST_FORMAT: 4, gs_usb.Request.BIT_TIMING: 20, gs_usb.Request.MODE: 8}
         if len(payload) < lengths.get(number, 1 << 16):
             raise libusb_error(errno.EPIPE)
         with self._changed:
-            if number == gs_usb.BIT_TIMING:
+            if number == gs_usb.Request.BIT_TIMING:
                 timing = BitTiming(*struct.unpack_from("<5I", payload))
                 self.right_bitrate = self._limits.clock_hz == timing.quanta * timing.brp * gs_usb.BITRATE_BIT_S
-            elif number == gs_usb.MODE:
+            elif number == gs_usb.Request.MODE:
                 wanted, features = struct.unpack_from("<II", payload)
                 self.started = wanted == 1
                 if self.started:
@@ -81,7 +81,7 @@ class GsUsbAdapter:
 
     def request_in(self, number: int) -> bytes:
         """Answer a request, or stall if it knows none such."""
-        if number != gs_usb.BIT_TIMING_LIMITS:
+        if number != gs_usb.Request.BIT_TIMING_LIMITS:
             raise libusb_error(errno.EPIPE)
         return struct.pack("<10I", *self._limits)
 

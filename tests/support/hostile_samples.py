@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from bridge_samples import REST_COUNTS as REST
 
-from firmware_bridge.scans.pad_constants import GAINS, Pad
+from firmware_bridge.pad_geometry import CHANNELS
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
@@ -47,7 +48,7 @@ def stored(members: dict[str, bytes], kind: int = zipfile.ZIP_STORED) -> bytes:
 
 def sensor_toml(folder: Path) -> bytes:
     """Return a sensor file with all that one may hold."""
-    pad = Pad(thickness_mm=4.5, intervals={"poisson": (0.4, 0.49)}, gains=(1.0,) * GAINS)
+    pad = Pad(thickness_mm=4.5, intervals={"poisson": (0.4, 0.49)}, gains=(1.0,) * CHANNELS)
     entry = SensorEntry(
         baseline=Baseline.of("4", REST.astype(np.float32), 1000.0, 100, "file"), counts_per_newton=1200.5, pad=pad
     )

@@ -16,8 +16,9 @@ import shapely
 import trimesh
 from numpy.typing import NDArray
 
+from firmware_bridge.pad_geometry import CHANNELS
 from firmware_bridge.recording.csv_reader import CSV_POSES, csv_header
-from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, Pad
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD, LEVEL_90, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train.data.presses import PressSet, one_thread
@@ -152,7 +153,7 @@ class Robot:
             values[name] = float(np.clip(getattr(self.pad.pad, name) + self.rng.uniform(-half, half), 0, None))
             ends[name] = (values[name] - half, values[name] + half)
         gains = tuple((self.gains * (1 + 0.02 * self.rng.standard_normal((3, 4, 4)).clip(-2, 2))).ravel().tolist())
-        pad = Pad(**values, intervals=ends, gains=gains, gain_half_widths=(LEVEL_90 * 0.02,) * GAINS)
+        pad = Pad(**values, intervals=ends, gains=gains, gain_half_widths=(LEVEL_90 * 0.02,) * CHANNELS)
         save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(pad=pad)}))
 
 

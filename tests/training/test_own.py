@@ -9,9 +9,10 @@ from press_samples import make_press_set
 
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
+from firmware_bridge.pad_geometry import CHANNELS
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import GAINS, Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
@@ -26,8 +27,8 @@ THICK = Pad(
     thickness_mm=5.0,
     intervals={"thickness_mm": (4.9, 5.1)},
     shear_modulus_mpa=0.12,
-    gains=(1.0,) * GAINS,
-    gain_half_widths=(0.025,) * GAINS,
+    gains=(1.0,) * CHANNELS,
+    gain_half_widths=(0.025,) * CHANNELS,
 )
 FILE = SensorFile(sensors={"4": SensorEntry(pad=THICK, counts_per_newton=1100.0)})
 BEYOND = SensorFile(sensors={"4": SensorEntry(pad=Pad(thickness_mm=50.0))})

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
-from edge.inference.bundled import TAXELS
+from edge.inference.bundled import TAXELS_FILE
 from edge.inference.onnx_session import ModelSession
 from edge.perception.run_options import ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Runtime
@@ -161,7 +161,7 @@ class Played(NamedTuple):
 def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | None = None) -> Played:
     """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred."""
     name = grip.free.sensor
-    estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
+    estimator = load_estimator(TAXELS_FILE, (USPA44.rows, USPA44.cols))
     options, free, mounted = RuntimeOptions(every_scan=True), {name: grip.free}, {name: grip.mounting}
     runtime = Runtime(
         model, source="replay", estimator=estimator, baselines=free, mountings=mounted, pad=pad, options=options

@@ -8,16 +8,15 @@ Source: Wu and Liu 2024, Eq. 7-8 (degradation).
 """
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.classical_methods import fit_linear_map, fitted_methods
-from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
+from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS_FILE, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.pad_geometry import TAXELS
 from train.data.presses import load_presses
 from train.data.real_grips import (
     has_hole,
@@ -35,13 +34,11 @@ from train.freeze import drawn
 from train.physics.gripped import SCALE
 from train.report import Report, Row, bootstrap_interval
 
-_TAXELS: Final = USPA44.taxel_count
-
 
 def real(bench: Workbench, report: Report) -> None:
     """Compare the default model with bilinear interpolation on real grips, in a minute or two."""
     grips = recorded_grips(recordings_folder())
-    bench.use(TAXELS)
+    bench.use(TAXELS_FILE)
     model = ModelSession(bench.use(find_model(DEFAULT_MODEL)))
     if bench.quick:
         readings, truth = drawn(solve_pad(World(count=24, per_pad=24, seed=3), 0), 100)
@@ -54,7 +51,7 @@ def real(bench: Workbench, report: Report) -> None:
     grips, whole = zip(*((grip, one) for grip, one in played if len(one.zeroed)), strict=True)
     z = [z_of(one.zeroed) for one in whole]
     hidden = [np.full_like(one, np.nan) for one in z]
-    for taxel in tracked(range(_TAXELS), "hidden", "taxel"):
+    for taxel in tracked(range(TAXELS), "hidden", "taxel"):
         for grip, estimates in zip(grips, hidden, strict=True):
             patterns = play(grip, model, taxel).patterns
             estimates[:, taxel] = patterns.reshape(len(patterns), -1) @ operator[:, taxel]

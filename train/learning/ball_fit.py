@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from firmware_bridge.pad_geometry import AXES, USPA44
+from firmware_bridge.pad_geometry import AXES, CHANNELS, TAXELS, USPA44
 from firmware_bridge.scans.pad_constants import LEVEL_90
 from firmware_bridge.scans.pad_constants import Pad as SensorPad
 from train.errors import DatasetError
@@ -22,14 +22,11 @@ from train.physics.gripped import MAX_INDENTATION_MM, GrippedPad
 from train.physics.pad_draws import RANGES, Pad
 from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances, neighbours
 
-TAXELS: Final = USPA44.taxel_count
-CHANNELS: Final = len(AXES) * TAXELS
 _OF_PAD: Final = len(RANGES) + 2  # its constants, the cross-talk, and the logarithm of the ball's radius
 _GAIN_SPREAD: Final = 0.086  # of chips, seats and moments together, one standard deviation
 # Deviations of a press about its first guess: x and y in [mm], log of depth, drag in [mm], log of friction.
 _MOVES: Final = (1.5, 1.5, 0.5, 0.15, 0.15, 0.5)
 _BALL_ERROR: Final = 0.05  # of the stated diameter, as a share of it, one standard deviation
-_CROSS_TALK: Final = Nuisances().cross_talk
 _FACTOR: Final = 0.03  # standard deviation of what the pad's lag makes of a press
 _LEFT_COUNTS: Final = (5.0, 5.0, 10.0)  # of drift, since the pad was free just before
 _NOISE_COUNTS: Final = 3.0
@@ -49,7 +46,7 @@ class _Presses:
 
     def __init__(self, presses: Sequence[NDArray[np.floating]], diameter_mm: float, known: SensorPad) -> None:
         radius = np.log(diameter_mm / 2) + _BALL_ERROR * np.array([-LEVEL_90, LEVEL_90])
-        ends = np.array([_known_ends(known, name) for name in RANGES] + [(0, _CROSS_TALK), radius])
+        ends = np.array([_known_ends(known, name) for name in RANGES] + [(0, Nuisances().cross_talk), radius])
         told = np.array([name in known.constants for name in RANGES] + [False, True])
         self.middle = ends.mean(axis=1)
         # A constant is normal within a measured interval, and else uniform within its range.

@@ -26,7 +26,7 @@ from edge.perception.gain_learning import (
     load_contact_model,
 )
 from firmware_bridge.in_place import check_writable, write_in_place
-from firmware_bridge.pad_geometry import AXES, USPA44
+from firmware_bridge.pad_geometry import AXES, CHANNELS, TAXELS, USPA44
 from firmware_bridge.scans.pad_constants import LEVEL_90
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet, load_presses
@@ -37,8 +37,6 @@ from train.physics.pad_draws import RANGES, Pad, draw_pad
 from train.physics.sensor_noise import Nuisances, apply_nuisances, neighbours
 
 CALIBRATION: Final = World(count=4800, per_pad=200, seed=9014)  # by which bias and intervals of learned gains are set
-TAXELS: Final = USPA44.taxel_count
-CHANNELS: Final = len(AXES) * TAXELS
 Z: Final = slice(AXES.index("z") * TAXELS, (AXES.index("z") + 1) * TAXELS)
 CONSTANTS: Final = (
     *("thickness_mm", "poisson", "in_plane_share", "magnet_height_mm", "pitch_mm", "free_sides"),

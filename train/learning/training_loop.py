@@ -28,7 +28,6 @@ Batches = Callable[[int], Batch]  # function from a number to its batch; the sam
 _WARM_UP: Final = 0.1
 _FIRST_SHARE: Final = 1 / 25
 _LAST_SHARE: Final = 1e-5
-_CLIP_NORM: Final = 1.0  # largest norm of a gradient
 
 # Errors of loading a file that is not what it should be.
 DAMAGES: Final = (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError)
@@ -115,7 +114,7 @@ def train(
                 descended = objective.loss(net, batch)
             optimizer.zero_grad()
             descended.backward()
-            norm = float(nn.utils.clip_grad_norm_(net.parameters(), _CLIP_NORM))
+            norm = float(nn.utils.clip_grad_norm_(net.parameters(), max_norm=1.0))
             loss = float(descended.detach())
             if not (isfinite(norm) and isfinite(loss)):
                 raise DivergedError(f"{resume_path.stem}: loss {loss} at step {step - 1}: lower the learning rate")

@@ -7,7 +7,8 @@ from train.errors import CheckpointError
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet
 from train.networks.fusion import FusionNet
-from train.networks.published import MAX_TAPS, SeedNet, TactileSRCNN, TactileSRGAN
+from train.networks.published import SeedNet, TactileSRCNN, TactileSRGAN
+from train.surfaces.poses import MAX_TAPS
 
 _TAPS: Final = {"stsr": 1} | {f"mtsr{taps}": taps for taps in range(2, MAX_TAPS + 1)}
 _WIDE: Final = {"channels": 64, "blocks": 6}

@@ -18,10 +18,10 @@ from torch.nn import functional as F
 
 from train.data.press_batches import Batch
 from train.networks.blocks import Objective, PatternNet, Residual, relative_error, truth_size
+from train.surfaces.poses import MAX_TAPS
 
-CHANNELS: Final = 64
+WIDTH: Final = 64
 BLOCKS: Final = 6
-MAX_TAPS: Final = 7
 _NORM_START: Final = 0.1  # initial scale and shift of batch normalisation, as in the authors' code
 _CRITIC_CHANNELS: Final = (32, 64, 128)
 _SLOPE: Final = 0.2
@@ -67,11 +67,11 @@ class SeedNet(_PublishedNet):
 
     def __init__(self, taps: int, scale: int) -> None:
         super().__init__(taps, scale)
-        self.stems = nn.ModuleList(nn.Sequential(_normed(3, CHANNELS), _normed(CHANNELS)) for _ in range(taps))
-        self.merge = _normed(taps * CHANNELS, CHANNELS)
-        self.trunk = nn.Sequential(*(_MultiScaleResidual(CHANNELS) for _ in range(BLOCKS)))
-        self.force = nn.Sequential(_plain(3, CHANNELS), nn.ReLU(), Residual(lambda: _plain(CHANNELS, bias=True)))
-        self.leave = nn.Sequential(_plain(2 * CHANNELS), nn.ReLU(), _plain(2 * CHANNELS, 1))
+        self.stems = nn.ModuleList(nn.Sequential(_normed(3, WIDTH), _normed(WIDTH)) for _ in range(taps))
+        self.merge = _normed(taps * WIDTH, WIDTH)
+        self.trunk = nn.Sequential(*(_MultiScaleResidual(WIDTH) for _ in range(BLOCKS)))
+        self.force = nn.Sequential(_plain(3, WIDTH), nn.ReLU(), Residual(lambda: _plain(WIDTH, bias=True)))
+        self.leave = nn.Sequential(_plain(2 * WIDTH), nn.ReLU(), _plain(2 * WIDTH, 1))
         self._initialise()
 
     def forward(self, window: Tensor) -> Tensor:
@@ -99,9 +99,9 @@ class TactileSRCNN(_PublishedNet):
     def __init__(self, scale: int) -> None:
         super().__init__(1, scale)
         self.net = nn.Sequential(
-            *(_normed(3, CHANNELS), _normed(CHANNELS), _normed(CHANNELS)),
-            *(_MultiScaleResidual(CHANNELS) for _ in range(BLOCKS)),
-            _plain(CHANNELS, 1),
+            *(_normed(3, WIDTH), _normed(WIDTH), _normed(WIDTH)),
+            *(_MultiScaleResidual(WIDTH) for _ in range(BLOCKS)),
+            _plain(WIDTH, 1),
         )
         self._initialise()
 

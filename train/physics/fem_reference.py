@@ -27,6 +27,7 @@ from firmware_bridge.errors import how_to_install
 from firmware_bridge.pad_geometry import USPA44
 from train.errors import TrainError
 from train.physics.elastic_layer import Layer
+from train.physics.gripped import SCALE
 from train.surfaces.depth_image import Pose, depth_image
 from train.surfaces.named_surfaces import relief
 
@@ -36,7 +37,6 @@ except ModuleNotFoundError as error:
     message = f"the FEM reference needs felupe (GPL): {how_to_install('fem')}"
     raise ModuleNotFoundError(message, name="felupe") from error
 
-SCALE: Final = 10  # patterns are compared at 40 x 40, as in the paper
 CENTRE: Final = Pose(0.0, 0.0, 0.0)  # position 5, rotation 0 of the paper
 # The solver's own Poisson's ratio is lower to account for free sides, which the elements have.
 LAYER: Final = replace(Layer(), poisson=0.495)

@@ -11,7 +11,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.pad_geometry import USPA44
+from edge.perception.taps import HALF_PITCH_MM
 from train.surfaces.depth_image import Pose
 
 Split = Literal["validation", "test"]
@@ -23,7 +23,6 @@ TARGET_ANGLES_DEG: Final = (0.0, 30.0, 60.0, 90.0)
 HELD_OUT_RADIUS_MM: Final = 1.0  # distance that random poses keep from the two held-out positions
 SURFACE_REACH_MM: Final = 3.5  # largest distance of random poses from the surface's centre along x and along y, in [mm]
 
-HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
 REACH_MM: Final = 6.0  # largest distance of an earlier tap: two thirds of both pads overlap at least, side by side
 NEAR_MM: Final = 3.0
 NEAR_DEG: Final = 45.0  # bounds of most random poses

@@ -1,6 +1,7 @@
 """State of each sensor in the terms of ROS's diagnostics: a level, a line of text, and values."""
 
 from collections.abc import Iterator, Mapping
+from enum import IntEnum
 from typing import Any, Final
 
 from edge.perception.event import Event
@@ -9,10 +10,17 @@ from edge.sinks.json_records import record
 from edge.sinks.ros2.messages import DIAGNOSTIC_ARRAY, header
 from firmware_bridge.schedule import SHOWN_SILENT_S
 
-OK, WARN, ERROR, STALE = range(4)  # levels, as in diagnostic_msgs/DiagnosticStatus
-_STATES: Final = {"incomplete": ERROR, "zeroing": WARN, "baseline_in_doubt": ERROR}
 _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")
 OUTAGES: Final = ("lost", "silent")
+
+
+class Level(IntEnum):
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
 
 
 class Diagnostics:
@@ -52,11 +60,11 @@ class Diagnostics:
         statuses = []
         for sensor, result in self._last.items():
             silence_s = None if now_ns is None else (now_ns - result.scan.time_ns) / 1e9
-            findings = [(STALE, "ended")] if ended else list(self._findings(sensor, result, silence_s))
+            findings = [(Level.STALE, "ended")] if ended else list(self._findings(sensor, result, silence_s))
             values = _values(result, self._counters, silence_s)
             statuses.append(
                 {
-                    "level": max((level for level, _ in findings), default=OK),
+                    "level": max((level for level, _ in findings), default=Level.OK),
                     "name": f"{self._topic}: {sensor}",
                     "message": "; ".join(text for _, text in findings) or result.state,
                     "hardware_id": sensor,
@@ -68,22 +76,23 @@ class Diagnostics:
 
     def _findings(self, sensor: str, result: Result, silence_s: float | None) -> Iterator[tuple[int, str]]:
         if result.source != "device":
-            yield WARN, f"{result.source.upper()}, not a sensor"
+            yield Level.WARN, f"{result.source.upper()}, not a sensor"
         if silence_s is not None and silence_s >= SHOWN_SILENT_S:
-            yield STALE, f"no scan for {silence_s:.0f} s"
-        yield from ((ERROR, text) for (name, _), text in self._troubles.items() if name == sensor)
-        if result.state in _STATES:
-            yield _STATES[result.state], result.note or result.state.replace("_", " ")
+            yield Level.STALE, f"no scan for {silence_s:.0f} s"
+        yield from ((Level.ERROR, text) for (name, _), text in self._troubles.items() if name == sensor)
+        if result.state in ("incomplete", "zeroing", "baseline_in_doubt"):
+            level = Level.WARN if result.state == "zeroing" else Level.ERROR
+            yield level, result.note or result.state.replace("_", " ")
         if result.dead:
-            yield WARN, f"without taxel {', '.join(f'{taxel} ({why})' for taxel, why in result.dead.items())}"
+            yield Level.WARN, f"without taxel {', '.join(f'{taxel} ({why})' for taxel, why in result.dead.items())}"
         if result.state == "contact" and result.trusted is False:
-            yield WARN, f"pattern not to be believed: {result.untrusted_text}"
+            yield Level.WARN, f"pattern not to be believed: {result.untrusted_text}"
         if result.drift is not None and result.drift.step_counts:
-            yield WARN, f"rest level off by {result.drift.step_counts:.0f} counts"
+            yield Level.WARN, f"rest level off by {result.drift.step_counts:.0f} counts"
         for name in _LOSSES:
             count = self._counters.get(name, 0) - self._counters_before.get(name, 0)
             if count > 0:
-                yield WARN, f"{count} {name}"
+                yield Level.WARN, f"{count} {name}"
 
 
 def _values(result: Result, counters: Mapping[str, int], silence_s: float | None) -> dict[str, str]:
