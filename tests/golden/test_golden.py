@@ -3,10 +3,12 @@
 `python tests/golden/test_golden.py [NAME...]` writes it again after a meant change.
 """
 
+import contextlib
 import json
-import subprocess
+import math
+import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,70 +21,112 @@ if __name__ == "__main__":  # as pyproject.toml has it for pytest
 
 from bridge_samples import write_npz
 from bridge_samples import write_recording as write_csv
-from cli_samples import EDGE_SR
-from golden_runs import brief, differences, edge_sr, environment, short
+from cli_samples import records, run
 
-from edge.api import demo_recording
-from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.slcan_emulator import Emulator, SlcanAdapter
-from firmware_bridge.recording.tracks import Recording, Track
+from edge import api
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT
 
-PITCH_MM = 4.7
-PLACES_MM = (np.arange(4) - 1.5) * PITCH_MM
-REST = np.array([16_000, 16_400, 38_600])[:, None, None] + 37 * np.arange(16).reshape(4, 4)
-FREE_SCANS = 110
-"""Scans of the free pad before the first press: those of a zeroing, and some."""
-TAP_SCANS = 40
-
-
-def readings(x_mm: float, y_mm: float, radius_mm: float, counts: float, drag: float = 0.0) -> np.ndarray:
-    """Return what a round press adds to the counts of the pad, (3, 4, 4), x right and y down.
-
-    `counts` is the z of its strongest taxel, and `drag` its drag along x.
-    """
-    x, y = np.meshgrid(PLACES_MM - x_mm, PLACES_MM - y_mm)
-    # The layer spreads a load by its thickness, and pushes material outwards at the edge of a contact.
-    z = counts * np.exp(-(x**2 + y**2) / (radius_mm**2 + 3.0**2))
-    return np.stack([z * (0.12 * x + drag), z * 0.12 * y, z])
-
-
-PRESSES = (
-    readings(0.0, 0.0, 5.0, 700),
-    readings(2.0, -3.0, 4.0, 900, drag=0.3),
-    readings(-4.0, 4.0, 6.0, 600),
-    readings(1.0, 1.0, 3.0, 1100, drag=-0.2),
-)
-
-
-def pressed(presses: Sequence[np.ndarray] = PRESSES, *, seed: int = 1) -> np.ndarray:
-    """Return the counts (n, 3, 4, 4) of a free pad and of taps, each pressed, held and released."""
-    force = np.concatenate([np.linspace(0, 1, 8), np.ones(12), np.linspace(1, 0, 8), np.zeros(TAP_SCANS - 28)])
-    taps = [force[:, None, None, None] * press for press in presses]
-    made = np.concatenate([np.zeros((FREE_SCANS, 3, 4, 4)), *taps])
-    noise = np.random.default_rng(seed).normal(0, 2, made.shape)
-    return np.rint(REST + made + noise).astype(np.int32)
-
-
-def gripped(scans: int = 200, *, free: int = 60) -> np.ndarray:
-    """Return the counts of a grip from the first scan, which is opened before the last `free` ones."""
-    load = np.ones(scans)
-    load[scans - free - 10 : scans - free], load[scans - free :] = np.linspace(1, 0, 10), 0
-    face = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), np.full((4, 4), 650.0)])
-    noise = np.random.default_rng(2).normal(0, 2, (scans, 3, 4, 4))
-    return np.rint(REST + load[:, None, None, None] * face + noise).astype(np.int32)
-
-
 FROZEN = Path(__file__).parent / "frozen"
+SAMPLED = 15
+"""Every so many records of a sensor one is kept whole, and the first two of each stretch of a state."""
+OF_THE_RUN = {
+    *("time_ns", "device_time_ns", "run_time_us", "latency_us", "counters", "baseline", "baseline_age_s", "event"),
+    *("events", "note", "notes"),
+}
+"""Keys that differ from run to run, or are kept apart."""
+RELATIVE, ABSOLUTE = 0.02, 2e-3
+"""Tolerances: 8-bit integers differ between processors by a thousandth of a pattern, and by as much of an area."""
+OWN_ABSOLUTE = {"force_counts": 1.0, "area_mm2": 3.0, "mean": 2e-3, "peak": 5e-3, "at": 2}
 MODEL = ("--model", "stsr-small-int8")
 RECORDS = ("--sink", "jsonl:-")
+FREE, PRESS = 150, slice(310)
+"""Scans of the demo's free pad before the first tap, and those until the end of the second."""
 Outcome = dict[str, Any]
+
+
+def edge_sr(folder: Path, *arguments: object) -> Outcome:
+    """Run edge-sr, in this process since as many starts take half a minute; return all that it says, in short."""
+    with contextlib.chdir(folder):
+        done = run(*arguments, COLUMNS="80", NO_COLOR="1")
+    told = [line for line in done.stdout.splitlines() if line.startswith("{")]
+    texts = [masked(line) for line in done.stdout.splitlines() if line not in told]
+    errors = [masked(line) for line in done.stderr.splitlines()]
+    return {"exit": done.returncode, "stdout": texts, "stderr": errors, **short(records("\n".join(told)))}
+
+
+def masked(text: str) -> str:
+    """Return a text without ids, paths of a folder and numbers."""
+    return re.sub(r"[-+]?\d[\d.,]*(e[-+]?\d+)?", "#", re.sub(r"/\S*/|\b[0-9a-f]{8}\b", "", text))
+
+
+def short(records: Sequence[dict[str, Any]]) -> Outcome:
+    """Return records in short: states in stretches, notes and events as they come, and some records whole."""
+    sensors: dict[str, Any] = {}
+    for record in records:
+        if record["state"] == "event":
+            sensors.setdefault("", {"events": []})["events"].append(masked(record["event"]))
+            continue
+        of = sensors.setdefault(record["sensor"], {"states": [], "notes": [], "events": [], "records": []})
+        if not of["states"] or of["states"][-1][0] != record["state"]:
+            of["states"].append([record["state"], 0])
+        of["states"][-1][1] += 1
+        note = record.get("note")
+        if note is not None and (not of["notes"] or of["notes"][-1][1] != masked(note)):
+            of["notes"].append([record["scan"], masked(note)])
+        if record.get("event"):
+            of["events"].append([record["scan"], masked(record["event"])])
+        if record["scan"] % SAMPLED == 0 or of["states"][-1][1] <= 2:
+            of["records"].append({key: brief(value) for key, value in record.items() if key not in OF_THE_RUN})
+    return {"sensors": sensors}
+
+
+def brief(value: Any) -> Any:
+    """Return a value, an array as its mean, its peak and the place of it."""
+    if isinstance(value, list) and value and isinstance(value[0], list) and len(value) > 2:
+        numbers = np.array(value, dtype=float)
+        rows = numbers.reshape(-1, numbers.shape[-1])
+        at = np.unravel_index(int(np.nanargmax(rows)), rows.shape)
+        return {"mean": float(np.nanmean(rows)), "peak": float(np.nanmax(rows)), "at": list(map(int, at))}
+    if isinstance(value, dict):
+        return {key: brief(one) for key, one in value.items()}
+    return value
+
+
+def differences(frozen: Any, now: Any) -> list[str]:
+    """Return where two outcomes differ by more than the tolerances, a line each."""
+    before, after = dict(leaves(frozen)), dict(leaves(now))
+    pairs = {place: (before.get(place, "nothing"), after.get(place, "nothing")) for place in before | after}
+    return [f"{place}: {b!r}, was {a!r}" for place, (a, b) in pairs.items() if not alike(a, b, place)]
+
+
+def leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the place and the value of all that an outcome is made of."""
+    parts = dict(enumerate(value)) if isinstance(value, list) else value
+    if not isinstance(parts, dict) or not parts:
+        yield place, value
+        return
+    for key, part in parts.items():
+        yield from leaves(part, f"{place}.{key}")
+
+
+def alike(frozen: Any, now: Any, place: str) -> bool:
+    if {type(frozen), type(now)} <= {int, float}:
+        key = re.findall(r"[a-z]\w*", place)[-1]
+        return math.isclose(frozen, now, rel_tol=RELATIVE, abs_tol=OWN_ABSOLUTE.get(key, ABSOLUTE))
+    return frozen == now
+
+
 SCENES: dict[str, Callable[[Path], Outcome]] = {}
 
 
 def scene(make: Callable[[Path], Outcome]) -> Callable[[Path], Outcome]:
     SCENES[make.__name__] = make
     return make
+
+
+def demo_counts() -> np.ndarray:
+    return load_recording(api.demo_recording()).tracks[0].counts.copy()
 
 
 def replayed(folder: Path, name: str, counts: np.ndarray, *words: object, rate_hz: int = 100) -> Outcome:
@@ -92,29 +136,24 @@ def replayed(folder: Path, name: str, counts: np.ndarray, *words: object, rate_h
 
 @scene
 def csv_replay(folder: Path) -> Outcome:
-    return replayed(folder, "press", pressed(), *MODEL)
+    return replayed(folder, "press", demo_counts()[PRESS], *MODEL)
 
 
 @scene
 def simulated_taps(folder: Path) -> Outcome:
     """The demo's recording, whose contacts are believed, in float32, which all processors round nearly alike."""
-    return edge_sr(folder, "replay", demo_recording(), "--duration-s", 5, "--model", "mtsr", *RECORDS)
-
-
-@scene
-def several_taps(folder: Path) -> Outcome:
-    return replayed(folder, "press", pressed([PRESSES[0]] * 4), "--model", "mtsr4")
+    return edge_sr(folder, "replay", api.demo_recording(), "--duration-s", 5, "--model", "mtsr", *RECORDS)
 
 
 @scene
 def chosen_fields_and_thresholds(folder: Path) -> Outcome:
     fields = ("--fields", "force_n,area_mm2", "--counts-per-newton", 1180, "--contact-on-counts", 4000)
-    return replayed(folder, "press", pressed(), *fields, *MODEL)
+    return replayed(folder, "press", demo_counts()[PRESS], *fields, *MODEL)
 
 
 @scene
 def recorded_and_replayed(folder: Path) -> Outcome:
-    write_csv(folder / "press.csv", pressed())
+    write_csv(folder / "press.csv", demo_counts()[PRESS])
     made = edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, *MODEL, "--sink", "mcap:press.mcap")
     again = edge_sr(folder, "replay", "press.mcap", *MODEL, *RECORDS)
     return {"made": made, "again": again}
@@ -122,30 +161,21 @@ def recorded_and_replayed(folder: Path) -> Outcome:
 
 @scene
 def two_fingers(folder: Path) -> Outcome:
-    write_csv(folder / "left.csv", pressed(seed=1))
-    write_csv(folder / "right.csv", pressed(PRESSES[::-1], seed=2))
+    write_csv(folder / "left.csv", demo_counts()[PRESS])
+    write_csv(folder / "right.csv", np.delete(demo_counts(), np.s_[FREE:390], axis=0)[PRESS])
     return edge_sr(folder, "replay", "left.csv,right.csv", "--rate-hz", 100, *MODEL, *RECORDS)
 
 
 @scene
-def hand(folder: Path) -> Outcome:
-    names = [f"pad{number}.csv" for number in range(16)]
-    for number, name in enumerate(names):
-        write_csv(folder / name, pressed(PRESSES[number % 4 :][:1], seed=number))
-    ran = edge_sr(folder, "replay", *names, "--rate-hz", 100, *MODEL, *RECORDS)
-    for sensor in ran["sensors"].values():
-        sensor["records"] = sensor.get("records", [])[-1:]
-    return ran
-
-
-@scene
 def begins_in_a_grip(folder: Path) -> Outcome:
-    return replayed(folder, "grip", gripped(), *MODEL, rate_hz=60)
+    counts = np.concatenate([demo_counts()[165:230], demo_counts()[:60]])
+    return replayed(folder, "grip", counts, *MODEL, rate_hz=60)
 
 
 @scene
 def never_free(folder: Path) -> Outcome:
-    return replayed(folder, "grip", gripped(free=0)[:-10], *MODEL, rate_hz=60)
+    counts = demo_counts()
+    return replayed(folder, "grip", counts[:FREE] + counts[180] - counts[0], *MODEL, rate_hz=60)
 
 
 @scene
@@ -153,168 +183,54 @@ def old_baseline(folder: Path) -> Outcome:
     """The pad's rest level has fallen since it was zeroed: alike on all taxels, and each by something of its own."""
     fallen = np.rint(np.random.default_rng(5).normal([[[60]], [[-20]], [[-500]]], 70, (3, 4, 4))).astype(np.int32)
     (folder / "earlier").mkdir()
-    write_csv(folder / "earlier" / "press.csv", pressed(()))
+    write_csv(folder / "earlier" / "press.csv", demo_counts()[:FREE])
     zeroed = edge_sr(folder, "baseline", "--source", "replay:earlier/press.csv", "--rate-hz", 100, "--out", "zero.json")
     return {
         "zeroed": zeroed,
-        "played": replayed(folder, "press", pressed() - fallen, "--baseline", "zero.json", *MODEL),
+        "played": replayed(folder, "press", demo_counts()[PRESS] - fallen, "--baseline", "zero.json", *MODEL),
     }
 
 
 @scene
 def faulty_taxels(folder: Path) -> Outcome:
     """Taxel 5 falls silent, taxel 10 repeats itself, and at last a field is added to all taxels."""
-    counts = pressed()
-    counts[FREE_SCANS:, :, 2, 2] = counts[FREE_SCANS, :, 2, 2]
-    counts[FREE_SCANS:, :, 1, 1] = ABSENT
+    counts = demo_counts()[PRESS]
+    counts[FREE:, :, 2, 2] = counts[FREE, :, 2, 2]
+    counts[FREE:, :, 1, 1] = ABSENT
     there = counts[-40:] != ABSENT
-    counts[-40:] += there * np.array([900, -400, 1500])[:, None, None]
+    counts[-40:] += there * np.array([900, -400, 1500], dtype=np.int32)[:, None, None]
     write_npz(folder / "faulty.npz", counts)
     return edge_sr(folder, "replay", "faulty.npz", *MODEL, *RECORDS)
 
 
 @scene
 def extreme_counts(folder: Path) -> Outcome:
-    counts = pressed()
-    counts[FREE_SCANS + 5, 2] = 65_535
-    counts[FREE_SCANS + 6, :, 1, 1] = 0
+    counts = demo_counts()[PRESS]
+    counts[FREE + 5, 2] = 65_535
+    counts[FREE + 6, :, 1, 1] = 0
     return replayed(folder, "extreme", counts, *MODEL)
 
 
 @scene
 def commands_and_poses(folder: Path) -> Outcome:
     """From Python: zeroing on demand in and out of contact, a reset, poses of four half-pitch taps."""
-    from edge import api
-
-    write_csv(folder / "press.csv", pressed([PRESSES[0]] * 4))
-    results = []
+    write_csv(folder / "press.csv", demo_counts()[:477])
+    stated = {150: (0, 0), 230: (2.35, 0), 310: (2.35, 2.35), 390: (0, 2.35)}
+    told = folder / "records.jsonl"
     with api.open_recording(folder / "press.csv", rate_hz=100.0) as source:
-        runtime = api.open_runtime("mtsr", source)
-        for result in api.Stream(source, runtime):
-            number = result.scan.number
-            if number % 40 == 0 and number > 100:
-                x_mm, y_mm = [(0, 0), (2.35, 0), (2.35, 2.35), (0, 2.35)][(number - 120) // 40 % 4]
-                runtime.pose(api.PadPose(x_mm, y_mm), result.scan.time_ns, holds=True)
-            if number in (FREE_SCANS + 10, FREE_SCANS + 35):
-                runtime.zero()
-            if number == FREE_SCANS + 120:
-                runtime.reset()
-            results.append(result)
-    return short(list(map(record_of, results)))
-
-
-def record_of(result: Any) -> dict[str, Any]:
-    kept = ("state", "contact", "taps_used", "force_counts", "trusted", "event", "note")
-    record = {"sensor": result.scan.sensor, "scan": result.scan.number} | {name: getattr(result, name) for name in kept}
-    record["next_tap"] = None if result.next_tap is None else [result.next_tap.dx_mm, result.next_tap.dy_mm]
-    return record | {"pattern": None if result.pattern is None else result.pattern.tolist()}
-
-
-class Adapter(SlcanAdapter):
-    """Adapter that may know no time stamps, and may lose and garble what it hands on, by the number of the frame."""
-
-    def __init__(self, *, stamped: bool, faulty: bool) -> None:
-        super().__init__()
-        self._stamped, self._faulty, self._frames, self._held = stamped, faulty, 0, b""
-
-    def feed(self, data: bytes) -> bytes:
-        return super().feed(data if self._stamped else data.replace(b"Z1", b"Z?"))
-
-    def encode(self, frame: CanFrame, time_s: float) -> bytes:
-        number, place = divmod(self._frames, 16)
-        self._frames += 1
-        line = super().encode(frame, time_s)
-        if not self._stamped:  # a scan at once, since arrivals are its times: a machine that stalls would tear it
-            self._held = line if place == 0 else self._held + line
-            return self._held if place == 15 else b""
-        if self._faulty and number % 15 == 9:
-            return b"garbage\r" * (place == 0) + line + b"t0048zz\r" * (place == 15)
-        return b"" if self._faulty and number % 15 == 7 and place == 5 else line
-
-
-def over_slcan(folder: Path, *, stamped: bool = True, faulty: bool = False) -> Outcome:
-    """Play presses over a link; states and forces depend on times, readings do not."""
-    recording = Recording(folder, (Track("4", pressed(PRESSES[:2]), None),), 100.0)
-    # A port of its own: a pseudo-terminal that is gone may be given to another, and the run tries it again.
-    port, adapter = folder / "port", Adapter(stamped=stamped, faulty=faulty)
-    with Emulator([recording], adapter=adapter, link=port):
-        command = [*EDGE_SR, "--source", f"slcan:{port}", "--duration-s", "4", *MODEL, *RECORDS]
-        ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, env=environment())
-    scans = [record for record in map(json.loads, ran.stdout.splitlines()) if record["state"] != "event"]
-    if not stamped:  # how many cycles wait for their pace to show depends on when they were read
-        return {"exit": ran.returncode, "fresh": sorted({one["fresh"] for one in scans}), "enough": len(scans) > 20}
-    kept = [{"scan": one["scan"], "counts": brief(one["counts"])} for one in scans if one["scan"] % 15 == 0]
-    return {"exit": ran.returncode, "fresh": [one["fresh"] for one in scans], "records": kept}
-
-
-@scene
-def slcan_stamped(folder: Path) -> Outcome:
-    return over_slcan(folder)
-
-
-@scene
-def slcan_without_stamps(folder: Path) -> Outcome:
-    return over_slcan(folder, stamped=False)
-
-
-@scene
-def slcan_with_faults(folder: Path) -> Outcome:
-    return over_slcan(folder, faulty=True)
-
-
-REFUSALS = (
-    "--source nowhere:1",
-    "--source slcan:/dev/none",
-    "--model none.onnx --source demo",
-    "--model press.csv --source demo",
-    "--sink nowhere:x --source demo",
-    "--sink jsonl:/none/x --source demo",
-    "--sink mcap:press.csv --source demo",
-    "--baseline press.csv --source demo",
-    "--sensor press.csv --source demo",
-    "--contact-on-counts 5 --contact-off-counts 9 --source demo",
-    "--contact-on-counts nan --source demo",
-    "--taps 9 --model mtsr4 --source demo",
-    "--duration-s -1 --source demo",
-    "--view 70000 --source demo",
-    "--poses mqtt:x --source demo",
-    "--id-map none --source demo",
-    "--sorce demo",
-    "replay",
-    "replay none.csv",
-    "replay press.txt",
-    "replay short.csv",
-    "replay text.csv",
-    "replay press.csv --fields nothing",
-    "replay press.csv --rate-hz 0",
-    "record x.txt --source nowhere",
-    "record press.csv --source demo --duration-s 1",
-    "record x.npz --source demo --duration-s 1",
-    "--sink npz:x.npz --source demo",
-    "convert press.csv",
-    "convert press.csv new.mcap",
-    "convert press.csv new.txt",
-    "convert none.mcap new.npz",
-    "baseline --source replay:short.csv --out z.json",
-    "models --nothing",
-    "doctor --source nowhere",
-    "map --out x.npz",
-    "devices --nothing",
-    "bench --only none",
-    "nothing",
-)
-"""Command lines of a person, in a folder with press.csv, short.csv, text.csv and press.txt."""
-
-
-@scene
-def refusals(folder: Path) -> Outcome:
-    counts = pressed(())
-    write_csv(folder / "press.csv", counts)
-    write_csv(folder / "short.csv", counts[:10])
-    (folder / "text.csv").write_text("a,b\n1,2\n")
-    (folder / "press.txt").write_text("nothing")
-    ran = {line: edge_sr(folder, *line.split()) for line in REFUSALS}
-    return {line: {key: done[key] for key in ("exit", "stderr")} for line, done in ran.items()}
+        model = api.load_model("mtsr")
+        runtime = api.open_runtime(model, source)
+        with contextlib.closing(api.open_sink(f"jsonl:{told}", model.contract, source)) as sink:
+            for result in api.Stream(source, runtime):
+                number = result.scan.number
+                if number in stated:
+                    runtime.pose(api.PadPose(*stated[number]), result.scan.time_ns, holds=True)
+                if number in (180, 215):
+                    runtime.zero()
+                if number == 300:
+                    runtime.reset()
+                sink.write(result, {})
+    return short(records(told.read_text()))
 
 
 def play(name: str) -> Outcome:
