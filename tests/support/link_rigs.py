@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 
 import can
-from bridge_samples import decoded, frames_of, make_counts, read_scans, wait_for, write_recording
+from bridge_samples import decoded, frames_of, make_counts, read_scans, write_recording
 from can.interfaces.virtual import VirtualBus
 from gs_usb_emulator import GsUsbBackend, GsUsbPort
 from xela_server_emulator import looping
@@ -130,12 +130,8 @@ class SlcanRig(CanRig):
 
     def sent(self, frames):
         decoder, heard = SlcanDecoder(), []
-
-        def hears():
-            heard.extend(decoded(decoder, b"".join(listen([self._port], 0.1).values())))
-            return len(heard) >= frames
-
-        wait_for(hears)
+        while len(heard) < frames:
+            heard += decoded(decoder, b"".join(listen([self._port], 0.1).values()))
         return heard
 
     def lose(self):
