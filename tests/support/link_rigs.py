@@ -120,6 +120,7 @@ class SlcanRig(CanRig):
         self._port = PseudoPort(folder / "skin")
         self._port.plug()
         self.name = f"slcan:{self._port.path}"
+        self.lose = self.close = self._port.unplug
 
     def make(self, **settings):
         return SlcanSerialLink(self._port.path, **settings)
@@ -134,14 +135,8 @@ class SlcanRig(CanRig):
             heard += decoded(decoder, b"".join(listen([self._port], 0.1).values()))
         return heard
 
-    def lose(self):
-        self._port.unplug()
-
     def put_back(self):
         self._port.plug(elsewhere=True)
-
-    def close(self):
-        self._port.unplug()
 
 
 class GsUsbRig(CanRig):
@@ -155,6 +150,7 @@ class GsUsbRig(CanRig):
         super().__init__()
         self._port = GsUsbPort()
         self._backend = GsUsbBackend(self._port)
+        self.put_back = self._port.plug
 
     def make(self, **settings):
         return GsUsbLink(backend=self._backend, **settings)
@@ -167,9 +163,6 @@ class GsUsbRig(CanRig):
 
     def lose(self):
         self._port.adapter.unplug()
-
-    def put_back(self):
-        self._port.plug()
 
 
 class PulledBus(VirtualBus):
@@ -205,6 +198,7 @@ class PythonCanRig(CanRig):
         self._far = VirtualBus(channel=self._channel, preserve_timestamps=True)
         self._plugged = threading.Event()
         self._plugged.set()
+        self.lose, self.put_back, self.close = self._plugged.clear, self._plugged.set, self._far.shutdown
         monkeypatch.setattr(can, "Bus", lambda *, channel, **_: PulledBus(self._plugged, channel=channel))
 
     def make(self, **settings):
@@ -216,15 +210,6 @@ class PythonCanRig(CanRig):
     def sent(self, frames):
         heard = [self._far.recv(1.0) for _ in range(frames)]
         return [CanFrame(one.arbitration_id, bytes(one.data), one.is_extended_id) for one in heard if one]
-
-    def lose(self):
-        self._plugged.clear()
-
-    def put_back(self):
-        self._plugged.set()
-
-    def close(self):
-        self._far.shutdown()
 
 
 def message_of(frame: CanFrame, **settings) -> can.Message:
