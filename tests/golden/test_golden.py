@@ -8,7 +8,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -140,13 +140,6 @@ def chosen_fields_and_thresholds(folder: Path) -> Outcome:
     return replayed(folder, "press", demo_counts()[PRESS], *fields, *MODEL)
 
 
-def recorded_and_replayed(folder: Path) -> Outcome:
-    write_csv(folder / "press.csv", demo_counts()[PRESS])
-    made = edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, *MODEL, "--sink", "mcap:press.mcap")
-    again = edge_sr(folder, "replay", "press.mcap", *MODEL, *RECORDS)
-    return {"made": made, "again": again}
-
-
 def two_fingers(folder: Path) -> Outcome:
     write_csv(folder / "left.csv", demo_counts()[PRESS])
     write_csv(folder / "right.csv", np.delete(demo_counts(), np.s_[FREE:390], axis=0)[PRESS])
@@ -214,20 +207,9 @@ def commands_and_poses(folder: Path) -> Outcome:
     return short(records(told.read_text()))
 
 
-SCENES: dict[str, Callable[[Path], Outcome]] = {
-    scene.__name__: scene
-    for scene in (
-        *(
-            csv_replay,
-            simulated_taps,
-            chosen_fields_and_thresholds,
-            recorded_and_replayed,
-            two_fingers,
-            begins_in_a_grip,
-        ),
-        *(never_free, old_baseline, faulty_taxels, extreme_counts, commands_and_poses),
-    )
-}
+OF_TAPS = (csv_replay, simulated_taps, chosen_fields_and_thresholds, two_fingers, commands_and_poses)
+OF_FAULTS = (begins_in_a_grip, never_free, old_baseline, faulty_taxels, extreme_counts)
+SCENES = {scene.__name__: scene for scene in OF_TAPS + OF_FAULTS}
 
 
 def play(name: str) -> Outcome:

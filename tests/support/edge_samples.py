@@ -273,11 +273,8 @@ class FakeLink(Link):
             self.ended = not self._endless
             return []
         batch = self._batches.pop(0)
-        if isinstance(batch, threading.Event):
-            batch.wait(10)
-            return []
-        if callable(batch):
-            batch()
+        if not isinstance(batch, list):
+            batch.wait(10) if isinstance(batch, threading.Event) else batch()
             return []
         self._given += len(batch)
         return [replace(scan, sensor=self.prefix + scan.sensor) for scan in batch] if self.prefix else batch
