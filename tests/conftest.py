@@ -14,8 +14,6 @@ from serial.tools.list_ports_common import ListPortInfo
 from edge.inference import bundled
 from firmware_bridge.links.serial_ports import Port
 
-MEMORY_LIMIT_BYTES = 60_000_000
-
 ROOT = Path(__file__).parents[1]
 # Programs that tests start find this checkout, whatever is installed; and their output is buffered, as usual, since the
 # rest of an unbuffered write that a signal interrupts is left out.
@@ -94,4 +92,4 @@ def bounded_memory():
     yield
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < MEMORY_LIMIT_BYTES
+    assert peak < 60_000_000

@@ -8,6 +8,7 @@ import re
 import subprocess
 from collections import Counter
 from functools import cache
+from itertools import permutations
 from pathlib import Path
 from urllib.parse import urldefrag
 
@@ -40,16 +41,12 @@ def drawn():
 def imported():
     """Return packages and rooms that there are, and the arrows that imports make."""
     graph = grimp.build_graph(*PACKAGES, cache_dir=None)
-    places, arrows = set(PACKAGES), set()
-    for module in graph.modules:
-        for other in (module, *graph.find_modules_directly_imported_by(module)):
-            one, two = (name.split(".")[:2] for name in (module, other))
-            if one[0] != two[0]:
-                arrows.add((one[0], two[0]))
-            elif one[0] in WITH_ROOMS and len(one) == len(two) == 2:
-                places.add(".".join(one))
-                arrows |= {(".".join(one), ".".join(two))} if one != two else set()
-    return places, arrows
+    floors = [PACKAGES, *map(graph.find_children, WITH_ROOMS)]
+    pairs = [pair for floor in floors for pair in permutations(floor, 2)]
+    arrows = [
+        pair for pair in pairs if graph.direct_import_exists(importer=pair[0], imported=pair[1], as_packages=True)
+    ]
+    return {place for floor in floors for place in floor}, arrows
 
 
 def test_the_page_draws_each_room_and_each_import_and_no_other():

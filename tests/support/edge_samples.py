@@ -225,10 +225,9 @@ class FakeModel:
         return pattern
 
     def run_together(self, windows, pads=None, poses=None) -> np.ndarray:
-        made = []
-        for index, window in enumerate(windows):
-            pad, rows = (None if more is None else more[index] for more in (pads, poses))
-            made.append((self.run(window, pad, rows), self.deviation, self.traction))
+        nothing = [None] * len(windows)
+        each = zip(windows, pads or nothing, poses or nothing, strict=True)
+        made = [(self.run(*one), self.deviation, self.traction) for one in each]
         patterns, deviations, tractions = zip(*made, strict=True)
         self.deviation = None if deviations[0] is None else np.stack(deviations)
         self.traction = None if tractions[0] is None else np.stack(tractions)
@@ -274,11 +273,8 @@ class FakeLink(Link):
             self.ended = not self._endless
             return []
         batch = self._batches.pop(0)
-        if isinstance(batch, threading.Event):
-            batch.wait(10)
-            return []
-        if callable(batch):
-            batch()
+        if not isinstance(batch, list):
+            batch.wait(10) if isinstance(batch, threading.Event) else batch()
             return []
         self._given += len(batch)
         return [replace(scan, sensor=self.prefix + scan.sensor) for scan in batch] if self.prefix else batch

@@ -16,6 +16,7 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -43,20 +44,29 @@ class GsUsbAdapter:
         self.right_bitrate = False  # true where its timing makes 1 Mbit/s
         self.sent: list[CanFrame] = []  # frames that it put on the bus for the client
         self.lost_frames = 0  # frames that had no room
-        self._limits = limits
+        self.limits = limits
         self._stamped = False
         self._overflowed = False
         self.queue: deque[bytes] = deque()  # host frames that wait to be fetched
         self._changed = threading.Condition()
         self.plugged = True  # while its cable is in
 
-    def hear(self, *frames: CanFrame, stamp_us: int | None = None, channel: int = 0) -> None:
+    def hear(self, *frames: CanFrame, stamp_us: int | None = None, channel: int = 0, flags: int = 0) -> None:
         """Receive frames from the bus, at `stamp_us` of its clock, by default now."""
-        self._receive(frames, 0, stamp_us, channel)
+        with self._changed:
+            for frame in frames:
+                if not (self.started and self.right_bitrate):
+                    return
+                if len(self.queue) >= QUEUE_FRAMES:
+                    self._overflowed = True
+                    self.lost_frames += 1
+                    continue
+                raw_id = frame.can_id | flags | gs_usb.EXTENDED * frame.extended | gs_usb.REMOTE * frame.remote
+                self._enqueue(gs_usb.RECEIVED, raw_id, len(frame.data), channel, frame.data, stamp_us)
 
-    def report(self, classes: int, data: bytes = bytes(8)) -> None:
+    def report(self, classes: int) -> None:
         """Send an error frame, of classes as in Linux's error.h."""
-        self._receive((CanFrame(classes, data),), gs_usb.ERROR, None, 0)
+        self.hear(CanFrame(classes, bytes(8)), flags=gs_usb.ERROR)
 
     def unplug(self) -> None:
         """Pull the cable out, and wake all who wait for it."""
@@ -72,18 +82,12 @@ class GsUsbAdapter:
         with self._changed:
             if number == gs_usb.Request.BIT_TIMING:
                 timing = BitTiming(*struct.unpack_from("<5I", payload))
-                self.right_bitrate = self._limits.clock_hz == timing.quanta * timing.brp * gs_usb.BITRATE_BIT_S
+                self.right_bitrate = self.limits.clock_hz == timing.quanta * timing.brp * gs_usb.BITRATE_BIT_S
             elif number == gs_usb.Request.MODE:
                 wanted, features = struct.unpack_from("<II", payload)
                 self.started = wanted == 1
                 if self.started:
-                    self._stamped = features & self._limits.features & gs_usb.HARDWARE_STAMPS != 0
-
-    def request_in(self, number: int) -> bytes:
-        """Answer a request, or stall if it knows none such."""
-        if number != gs_usb.Request.BIT_TIMING_LIMITS:
-            raise libusb_error(errno.EPIPE)
-        return struct.pack("<10I", *self._limits)
+                    self._stamped = features & self.limits.features & gs_usb.HARDWARE_STAMPS != 0
 
     def take(self, data: bytes) -> None:
         """Take a host frame to send, and echo it."""
@@ -98,18 +102,6 @@ class GsUsbAdapter:
         with self._changed:
             self._changed.wait_for(lambda: not self.plugged or self.queue, timeout_s)
             return self.queue.popleft() if self.plugged and self.queue else None
-
-    def _receive(self, frames: tuple[CanFrame, ...], flags: int, stamp_us: int | None, channel: int) -> None:
-        with self._changed:
-            for frame in frames:
-                if not (self.started and self.right_bitrate):
-                    return
-                if len(self.queue) >= QUEUE_FRAMES:
-                    self._overflowed = True
-                    self.lost_frames += 1
-                    continue
-                raw_id = frame.can_id | flags | gs_usb.EXTENDED * frame.extended | gs_usb.REMOTE * frame.remote
-                self._enqueue(gs_usb.RECEIVED, raw_id, len(frame.data), channel, frame.data, stamp_us)
 
     def _enqueue(self, echo_id: int, raw_id: int, dlc: int, channel: int, payload: bytes, stamp_us: int | None) -> None:
         flags = gs_usb.OVERFLOW_FLAG if self._overflowed and echo_id == gs_usb.RECEIVED else 0
@@ -137,7 +129,8 @@ class GsUsbPort:
         """Plug an adapter in; `adapter` makes a new one each time."""
         self.serial_number = serial_number
         self.product = product
-        self.kernel_driver = self.claimed = False  # who holds it
+        self.kernel_driver = False  # it holds the adapter
+        self.claimed: _Plugged | None = None  # by which handle
         self.handles = 0  # how often it is open
         self.permitted = True  # the user may open it
         self.gone_as = errno.ENODEV  # the error of libusb that unplugging gives; host controllers differ
@@ -151,17 +144,16 @@ class GsUsbPort:
     def plug(self) -> None:
         """Plug it in again: a new adapter under another address."""
         self.address += 1
-        self.claimed = False
+        self.claimed = None
         self.adapter = self._make()
 
 
+@dataclass(eq=False)  # each is a program of its own
 class _Plugged:
     """Handle by which libusb identifies a device: gone for good once it was unplugged."""
 
-    def __init__(self, port: GsUsbPort) -> None:
-        self.port = port
-        self.adapter = port.adapter
-        self.claimed_here = False
+    port: GsUsbPort
+    adapter: GsUsbAdapter
 
     def check(self) -> GsUsbAdapter:
         if not self.adapter.plugged:
@@ -180,7 +172,7 @@ class GsUsbBackend(usb.backend.IBackend):
     # What stands in the descriptors.
 
     def enumerate_devices(self) -> Iterator[_Plugged]:
-        return iter([_Plugged(port) for port in self.ports if port.adapter.plugged])
+        return iter([_Plugged(port, port.adapter) for port in self.ports if port.adapter.plugged])
 
     def get_device_descriptor(self, dev: _Plugged) -> SimpleNamespace:
         vendor, product = dev.port.usb_id
@@ -232,9 +224,9 @@ class GsUsbBackend(usb.backend.IBackend):
 
     def claim_interface(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
-        if dev_handle.port.kernel_driver or (dev_handle.port.claimed and not dev_handle.claimed_here):
+        if dev_handle.port.kernel_driver or dev_handle.port.claimed not in (None, dev_handle):
             raise libusb_error(errno.EBUSY)
-        dev_handle.port.claimed = dev_handle.claimed_here = True
+        dev_handle.port.claimed = dev_handle
 
     def release_interface(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
@@ -274,8 +266,10 @@ class GsUsbBackend(usb.backend.IBackend):
             return len(data)
         if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):  # get a descriptor, of a text
             answer = self._text(dev_handle.port, wValue & 0xFF)
-        else:
-            answer = adapter.request_in(bRequest)
+        elif bRequest == gs_usb.Request.BIT_TIMING_LIMITS:
+            answer = struct.pack("<10I", *adapter.limits)
+        else:  # it knows none such, and stalls
+            raise libusb_error(errno.EPIPE)
         answer = answer[: len(data)]
         data[: len(answer)] = array("B", answer)
         return len(answer)
@@ -299,12 +293,12 @@ class GsUsbBackend(usb.backend.IBackend):
         return len(data)
 
     def _check_claim(self, handle: _Plugged) -> None:
-        if not handle.claimed_here:
+        if handle.port.claimed is not handle:
             raise libusb_error(errno.EIO)
 
     def _let_go(self, handle: _Plugged) -> None:
-        if handle.claimed_here:
-            handle.port.claimed = handle.claimed_here = False
+        if handle.port.claimed is handle:
+            handle.port.claimed = None
 
     def _text(self, port: GsUsbPort, index: int) -> bytes:
         if index == 0:

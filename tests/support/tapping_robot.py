@@ -1,12 +1,5 @@
-"""Emulated robot that taps printed plates with a pad unlike all others, and states its poses with an error.
+"""Emulated robot that taps printed plates with a pad unlike all others, and states its poses with an error."""
 
-    python tests/support/tapping_robot.py FOLDER
-
-writes two recordings and the sensor file of `train.taps` and `train.own`, and presses.npz, which only an emulation can
-know: the true patterns of figures that are on neither plate.
-"""
-
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -21,24 +14,20 @@ from firmware_bridge.recording.csv_reader import CSV_POSES, csv_header
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, LEVEL_90, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
-from train.data.presses import PressSet, one_thread
-from train.families.catalogue import heights_of
-from train.physics.gripped import FINE_SCALE, SAMPLES, SCALE, GrippedPad, Taps, between_frames
-from train.physics.pad_draws import INPUTS, RANGES, constants, draw_pad
-from train.physics.tpsf import resample, resample_touching
+from train.data.presses import one_thread
+from train.physics.gripped import SAMPLES, GrippedPad, between_frames
+from train.physics.pad_draws import INPUTS, RANGES, draw_pad
 from train.surfaces.depth_image import Pose, Relief, depth_image
-from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, LETTERS, SHAPES, figure
-from train.surfaces.poses import random_poses
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, figure
 
 PLACES_MM = (-2.5, 0.0, 2.5)
-TURNS_DEG = (0.0, 30.0, 60.0, 90.0)
+TURN_DEG = 30.0
 FREE, RISE, HOLD, FALL = 20, 24, 4, 8  # scans of each tap
-FORCE_N = 8.0
+FORCE_N = 8.0  # of a tap, or as deep as the layer is linear
 MISPLACED = np.array([0.3, -0.2, 0.3])  # of the plate in the frame of the poses: x, y in [mm], turn in [deg]
 JITTER = np.array([0.05, 0.05, 0.2])  # of each pose
 SIGNATURE = (0.04, 0.04, 0.085)  # of each channel over the mean z, as on two real sensors
-KNOWN_TO = 0.1  # share of its range within which each constant of the pad is known
-PLATES = {"letters": LETTERS, "shapes": SHAPES}
+KNOWN_TO = 0.02  # share of its range within which each constant of the pad is known
 GRID_MM = 30.0  # distance of a printed plate's figures: a turned pad on one of them does not reach the next
 PRINTED_MM = 4.0  # thickness of a printed plate, which must not bend
 
@@ -84,20 +73,26 @@ class Robot:
         own = clean * self.gains + self.signature * clean[:, 2].mean(axis=(1, 2))[:, None, None, None]
         return np.rint(own + 2.0 * self.rng.standard_normal(own.shape))
 
-    def tap(self, heights_mm: NDArray[np.float32]) -> Taps:
-        """Press straight down to the force, or as deep as the layer is linear."""
-        return self.pad.tap(heights_mm, FORCE_N * self.rng.uniform(0.9, 1.1))
-
     @one_thread()
-    def record(self, path: Path, surface: Relief, poses: Sequence[Pose]) -> Tapped:
-        """Tap a surface at these poses, and write a CSV of the scans, with the poses that the robot states."""
+    def record_plate(self, path: Path, names: Sequence[str]) -> Tapped:
+        """Tap every figure of a plate at the paper's 9 places and one of its turns.
+
+        A CSV has the scans, and the poses that the robot states.
+        """
+        poses = [
+            Pose(middle[0] + x_mm, middle[1] + y_mm, TURN_DEG)
+            for _, middle in zip(names, grid_places_mm(), strict=False)
+            for y_mm in PLACES_MM
+            for x_mm in PLACES_MM
+        ]
+        plate, size, cell_mm = Relief("plate", plate_mesh(names)), self.pad.size * SAMPLES, self.pad.cell_mm / SAMPLES
         rows, stated, depths, units = [np.zeros((100, 3, 4, 4))], [np.tile((0.0, 0.0, 0.0), (100, 1))], [], []
         rise, fall = np.linspace(0, 1, RISE + 1)[1:], np.linspace(1, 0, FALL + 1)[1:]
         share = np.concatenate([np.zeros(FREE), rise, np.ones(HOLD), fall])
         for pose in poses:
             true = Pose(*(np.array(pose) + MISPLACED + JITTER * self.rng.standard_normal(3).clip(-2, 2)).tolist())
-            size, cell_mm = self.pad.size * SAMPLES, self.pad.cell_mm / SAMPLES
-            one = self.tap(-depth_image(surface, true, size, cell_mm)[None])
+            heights_mm = -depth_image(plate, true, size, cell_mm)
+            one = self.pad.tap(heights_mm[None], FORCE_N * self.rng.uniform(0.9, 1.1))
             rows.append(between_frames(one.counts, share[None])[0])
             stated.append(np.tile((pose.x_mm, -pose.y_mm, -pose.angle_deg), (len(share), 1)))
             depths.append(one.indentation_mm[0, -1])
@@ -112,72 +107,13 @@ class Robot:
         np.savetxt(path, np.concatenate([time_s, table], axis=1), form, ",", header=header, comments="")
         return Tapped(np.array(depths), np.array(units))
 
-    def record_plate(self, path: Path, names: Sequence[str]) -> Tapped:
-        """Tap every figure of a plate at the paper's 9 places and 4 turns."""
-        poses = [
-            Pose(middle[0] + x_mm, middle[1] + y_mm, turn_deg)
-            for _, middle in zip(names, grid_places_mm(), strict=False)
-            for y_mm in PLACES_MM
-            for x_mm in PLACES_MM
-            for turn_deg in TURNS_DEG
-        ]
-        return self.record(path, Relief("plate", plate_mesh(names)), poses)
-
-    @one_thread()
-    def presses(self, names: Sequence[str], shares: Sequence[float] = (0.25, 0.5, 0.75, 1.0)) -> PressSet:
-        """Return readings and true patterns of figures of any name, each at a pose of its own and at these shares."""
-        sets = []
-        for number, (name, pose) in enumerate(zip(names, random_poses(self.rng, len(names)), strict=True)):
-            one, n = self.tap(heights_of(name, pose, self.pad)[None]), len(shares)
-            depth_mm = (one.indentation_mm[0, -1] * np.array(shares)).astype(np.float32)
-            unit = resample(one.unit_patterns, FINE_SCALE, SCALE)[0]
-            made = {
-                "family": np.array([name] * n),
-                "pad": np.full(n, number),
-                "constants": np.tile(constants(self.pad.pad), (n, 1)),
-                "counts": self.read(between_frames(one.counts, np.array(shares)[None])[0])[:, None].astype(np.float32),
-                "patterns": (unit * depth_mm[:, None, None]).astype(np.float16),
-                "touching": np.repeat(resample_touching(one.touching, FINE_SCALE, SCALE), n, axis=0),
-                "traction_kpa": np.full((n, 3, 8, 8), np.nan, np.float16),
-                "indentation_mm": depth_mm,
-            }
-            shapes = {"angle_deg": (n, 1), "poses": (n, 1, 3), "force_n": (n, 3), "twist_nmm": (n,)}
-            sets.append(made | {key: np.zeros(shape, np.float32) for key, shape in shapes.items()})
-        return PressSet(**{key: np.concatenate([one[key] for one in sets]) for key in sets[0]}, config={"own": True})
-
-    def save_sensor_file(self, path: Path, known_to: float = KNOWN_TO) -> None:
+    def save_sensor_file(self, path: Path) -> None:
         """Write what a user knows of the sensor: constants within a share of their range, gains to 2 %."""
         values, ends = {}, {}
         for name in INPUTS:
-            half = known_to * (RANGES[name][1] - RANGES[name][0]) / 2
+            half = KNOWN_TO * (RANGES[name][1] - RANGES[name][0]) / 2
             values[name] = float(np.clip(getattr(self.pad.pad, name) + self.rng.uniform(-half, half), 0, None))
             ends[name] = (values[name] - half, values[name] + half)
         gains = tuple((self.gains * (1 + 0.02 * self.rng.standard_normal((3, 4, 4)).clip(-2, 2))).ravel().tolist())
         pad = Pad(**values, intervals=ends, gains=gains, gain_half_widths=(LEVEL_90 * 0.02,) * CHANNELS)
         save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(pad=pad)}))
-
-
-def make(folder: Path, seed: int = 7) -> dict[str, Tapped]:
-    """Write everything that a user has after a day with the robot, and the presses on other figures."""
-    folder.mkdir(parents=True, exist_ok=True)
-    robot = Robot(seed)
-    robot.save_sensor_file(folder / "sensor.toml")
-    known = {}
-    for plate, names in PLATES.items():
-        plate_mesh(names).export(folder / f"{plate}.stl")
-        known[plate] = robot.record_plate(folder / f"{plate}.csv", names)
-        np.savez_compressed(folder / f"{plate}-truth.npz", **known[plate]._asdict())
-    names = [f"{kind}:{4000 + number}" for number in range(60) for kind in ("glyph", "polygon")]
-    robot.presses(names).save(folder / "presses.npz")
-    return known
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, metavar="FOLDER")
-    make(parser.parse_args(arguments).folder)
-
-
-if __name__ == "__main__":
-    main()

@@ -5,7 +5,6 @@ restart. Messages made by hand are here as well.
 """
 
 import json
-import logging
 import math
 import threading
 import time
@@ -27,12 +26,7 @@ from firmware_bridge.scans.xela_server_messages import WELCOME
 
 UNIX_S: Final = 1_768_365_606.25
 MS: Final = 1_000_000
-
-
 HOST: Final = "127.0.0.1"  # this machine alone, so that no other one takes its messages for a sensor's
-_QUIET: Final = logging.getLogger("xela_server_emulator")
-_QUIET.addHandler(logging.NullHandler())
-_QUIET.propagate = False
 
 
 class ServerEmulator:
@@ -86,8 +80,7 @@ class ServerEmulator:
         def hold(client: ServerConnection, request: Request) -> None:
             self._answers.wait()
 
-        settings: dict[str, Any] = {"compression": None, "logger": _QUIET, "process_request": hold}
-        self._server = serve(self._attend, HOST, self._port, **settings)
+        self._server = serve(self._attend, HOST, self._port, compression=None, process_request=hold)
         self._port = self._server.socket.getsockname()[1]
         self._thread = threading.Thread(target=self._server.serve_forever)
         self._thread.start()

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
-import tapping_robot
 from bridge_samples import write_npz
 from edge_samples import make_contract, write_model
 from matplotlib.image import imsave
 from press_samples import make_press_set
-from tapping_robot import Robot, plate_mesh
+from tapping_robot import Robot, grid_places_mm, plate_mesh
 
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
@@ -37,12 +36,10 @@ FIGURES = ("T", "L", "hollow square")
 def tapped(tmp_path_factory):
     """A folder with a recording of three figures at nine places each, its surface, the sensor file, and the truth."""
     folder = tmp_path_factory.mktemp("robot")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tapping_robot, "TURNS_DEG", (30.0,))
-        robot = Robot()
-        robot.save_sensor_file(folder / "sensor.toml", known_to=0.02)
-        plate_mesh(FIGURES).export(folder / "plate.stl")
-        return folder, robot.record_plate(folder / "plate.csv", FIGURES)
+    robot = Robot()
+    robot.save_sensor_file(folder / "sensor.toml")
+    plate_mesh(FIGURES).export(folder / "plate.stl")
+    return folder, robot.record_plate(folder / "plate.csv", FIGURES)
 
 
 @pytest.fixture(autouse=True)
@@ -134,7 +131,7 @@ def test_a_depth_image_lies_as_the_mesh(tapped):
     steps = (np.arange(900) + 0.5) / 10 - 45
     x_mm, y_mm = np.meshgrid(steps, -steps)
     image = np.zeros((900, 900))
-    for name, (right, up) in zip(FIGURES, tapping_robot.grid_places_mm(), strict=False):
+    for name, (right, up) in zip(FIGURES, grid_places_mm(), strict=False):
         image[shapely.contains_xy(figure(name), x_mm - right, y_mm - up)] = 1
     drawn, expected = image_surface(image, 0.1)(pose, pad) > -1, mesh(pose, pad) > -1
     assert expected.mean() > 0.05 and (drawn == expected).mean() > 0.99
