@@ -204,22 +204,6 @@ MS = 1_000_000
 # Time stamps.
 
 
-@pytest.mark.parametrize("cut", [1, 100, 1000])
-def test_any_chunking_gives_the_same_times(cut):
-    """The frames of two sensors mix, so that no cycle is whole; frames that came in time set the clock first."""
-    lines = [line for n in range(9) for line in cycle_lines(n, 110 + 10 * n)]
-    mixed = [one for line in lines for one in (line, line[:3] + b"6" + line[4:])]
-    for text in (b"".join(lines), b"".join(mixed)):
-        whole, pieces = SlcanScans(), SlcanScans()
-        for scans in (whole, pieces):
-            scans.feed(b"".join(cycle_lines(0, 100)), 10**12 - 10**9)
-        expected = whole.feed(text, 10**12)
-        got = [scan for at in range(0, len(text), cut) for scan in pieces.feed(text[at : at + cut], 10**12)]
-        assert [scan.device_ns for scan in got] == [scan.device_ns for scan in expected]
-        assert {scan.device_ns for scan in got} == {10**12 - 10**9 + (10 + 10 * n) * MS for n in range(9)}
-        assert whole.counters() == pieces.counters()
-
-
 def test_stamps_count_from_zero_again_each_minute():
     scans, at_ms = SlcanScans(), ((59_800, 0), (59_900, 100), (100, 340))  # the last of them is read late
     first, second, third = (scans.feed(b"".join(cycle_lines(1, ms)), 10**12 + read * MS)[0] for ms, read in at_ms)
