@@ -23,16 +23,6 @@ every_reader = pytest.mark.parametrize("how", [PLAIN, STAMPED, PLAIN_BURSTS, STA
 
 
 @every_reader
-@pytest.mark.parametrize("first_frame", [0, 1, 7, 8, 15])
-def test_who_joins_anywhere_has_the_next_cycle(how, first_frame):
-    found = read(bus(12)[first_frame:], *how)
-    assert found.mixed == 0 and found.numbers["4"][0] == (first_frame > 0)
-    if how is not PLAIN_BURSTS:
-        assert found.counters["resynchronised"] == (16 - first_frame) % 16
-        assert found.whole == 12 - (first_frame > 0)
-
-
-@every_reader
 @pytest.mark.parametrize(
     ("fault", "share", "rates_hz", "fewest", "in_bursts"),
     [

@@ -81,12 +81,7 @@ def test_the_state_that_the_controller_reports():
     with link:
         port.adapter.report(0x40)
         link.read(0.0)
-        assert "bus-off" in (link.trouble or "")
-        port.adapter.hear(frames_of(1)[0])
-        link.read(0.0)
-        assert link.trouble is None and link.counters()["bus_off"] == 1
-        port.adapter.report(0x40)
-        link.read(0.0)
+        assert "bus-off" in (link.trouble or "") and link.counters()["bus_off"] == 1
     with link:
         link.read(0.0)
         assert link.trouble is None, "it began anew"

@@ -4,9 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bridge_samples import write_recording as write_csv
-from cli_samples import write_recording as write_npz
-from edge_samples import BASELINE, make_scan
+from edge_samples import make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from xela_server_emulator import message, sensor_entry
@@ -15,12 +13,11 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.recording.csv_reader import csv_header
-from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP, XR1944_MAP
+from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP, XR1944_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting, placed_map
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.xela_server_scans import ServerScans
-from firmware_bridge.zeroing.baseline import deformation
 
 BACKWARDS = [3, 2, 1, 0]
 
@@ -128,13 +125,6 @@ def test_what_a_mounting_moves_and_what_costs_nothing():
     assert TURNED.order[0] == 3 and placed_map(USPA44_MAP, {"4": TURNED}).taxels[0x004] == ("4", 0)
 
 
-def test_deformation_is_corrected_once():
-    scan = make_scan(press_counts=900, absent=(2,))
-    plain, corrected = (deformation(scan.counts, BASELINE, mounting) for mounting in (None, Mounting(signs=(1, 1, -1))))
-    assert corrected[2, 1, 1] == -900 == -plain[2, 1, 1] and np.isnan(corrected[:, 0, 2]).all()
-    assert np.array_equal(corrected[:2], plain[:2], equal_nan=True)
-
-
 def test_a_mounting_that_cannot_be_is_refused(tmp_path):
     for order in ((0,) * 16, tuple(range(15))):
         with pytest.raises(ValueError, match=r"each of 0\.\.15 once"):
@@ -145,17 +135,3 @@ def test_a_mounting_that_cannot_be_is_refused(tmp_path):
     (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(24)), ",".join(["1000"] * 3 * 24), ""]))
     with pytest.raises(SourceError, match=r"4\.csv has 24 taxels, .* sensor 4 has 16: leave out"):
         open_sources([f"replay:{tmp_path}/4.csv"], 100.0, mountings={"4": Mounting()})
-
-
-def test_csv_of_the_vendors_server_alone_is_put_in_place(tmp_path):
-    """A CSV is as the server wrote it; edge-sr writes what it has already put in place."""
-    counts = make_scan(0, noise=3).counts
-    write_csv(tmp_path / "4.csv", counts[None])
-    write_npz(tmp_path / "4.npz", [0])
-    for name, expected in (("4.csv", TURNED.place_counts(counts)), ("4.npz", counts)):
-        texts = [f"replay:{tmp_path}/{name}"]
-        (opened,) = open_sources(texts, 1000.0, model=ID_MAPS["A"], mountings={"4": TURNED})
-        with opened as link:
-            assert link.kind == "replay"
-            (scan,) = [scan for _ in range(2) if not link.ended for scan in link.read(1.0)]
-        assert np.array_equal(scan.counts, expected) and link.counters()["scans"] == 1

@@ -1,5 +1,7 @@
 """Poses of a pad, and their course over time; in recordings they are played at the scans that they served."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
@@ -90,33 +92,21 @@ POSES = [
 ]
 
 
-class PosedRuntime(Runtime):
-    """Runtime that also lists its poses and scans in the order in which they come."""
-
-    def __init__(self):
-        super().__init__(FakeModel(), source="replay", baselines={"4": BASELINE})
-        self.seen = []
-
-    def pose(self, pose, time_ns, sensor=None, *, holds=False):
-        self.seen.append(TimedPose(pose, time_ns, sensor, holds))
-        return super().pose(pose, time_ns, sensor, holds=holds)
-
-    def take(self, scan, clock_ns=None):
-        self.seen.append(scan.time_ns)
-        return super().take(scan, clock_ns)
-
-
 def make_scans():
     return [make_scan(number, time_ns=10**9 + number * STEP_NS, press_counts=3000, noise=3) for number in range(6)]
 
 
-def record(path, poses=POSES):
+def poses_of(number, scan):
+    """Return the poses that are first used for a scan."""
+    return [replace(pose, used_from_ns=scan.time_ns) for pose, first in POSES if first == number]
+
+
+def record(path):
     """Record scans and poses as a run would."""
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
     sink = McapSink(path, FakeModel().contract, fake_source(unix_offset_ns=OFFSET_NS))
     for number, scan in enumerate(make_scans()):
-        mine = [TimedPose(p.pose, p.time_ns, p.sensor, p.holds, scan.time_ns) for p, first in poses if first == number]
-        if mine:
+        if mine := poses_of(number, scan):
             sink.pose(mine)
         sink.write(runtime.push(scan), {})
     sink.close()
@@ -125,18 +115,20 @@ def record(path, poses=POSES):
 
 def test_poses_are_played_at_the_scans_that_they_served_again(tmp_path):
     """Also by a recording of a replay."""
-    expected = []
-    for number, scan in enumerate(make_scans()):
-        expected += [*(pose for pose, first in POSES if first == number), scan.time_ns]
+    expected = [one for number, scan in enumerate(make_scans()) for one in (*poses_of(number, scan), scan.time_ns)]
     path = record(tmp_path / "0.mcap")
     for again in ("1.mcap", "2.mcap"):
-        runtime, statistics = PosedRuntime(), api.Statistics()
+        seen, statistics = [], api.Statistics()
+        with api.open_recording(path) as source:
+            while (taken := source.take(1.0)) is not None:
+                seen += taken
+        assert [one if isinstance(one, TimedPose) else one.time_ns for one in seen] == expected
         with api.open_recording(path) as source:
             path = tmp_path / again
             sink = McapSink(path, FakeModel().contract, fake_source(unix_offset_ns=OFFSET_NS))
-            api.pump(source, runtime, [sink], statistics)
+            api.pump(source, Runtime(FakeModel(), source="replay", baselines={"4": BASELINE}), [sink], statistics)
             sink.close()
-        assert runtime.seen == expected and (statistics.poses, statistics.poses_refused) == (len(POSES), 0)
+        assert (statistics.poses, statistics.poses_refused) == (len(POSES), 0)
 
 
 def test_poses_of_another_program_are_interpolated_in_time(tmp_path):
