@@ -146,9 +146,6 @@ def test_counters_are_of_whole_steps(rig, step, monkeypatch):
     assert early == [False], "it was answered in the middle"
 
 
-# Links that see the frames themselves.
-
-
 @of(CAN)
 def test_the_same_frames_make_the_same_scans(rig):
     frames = [frame for pair in zip(frames_of(30), frames_of(30, controller=6, seed=1), strict=True) for frame in pair]

@@ -42,9 +42,6 @@ BUS_OFF, PASSIVE = error_message(0x40), error_message(4, 0, 0x10)
 FRAME = message_of(frames_of(1)[0])
 
 
-# Clocks.
-
-
 def test_frames_without_stamps_frames_of_fd_and_unknown_errors(bus):
     now_ns = itertools.count(5 * 10**12, 1_000_000)  # a machine that pauses here must make no pause on the bus
     with link_to(bus, clock_ns=now_ns.__next__) as link:
@@ -68,9 +65,6 @@ def test_stamps_that_count_from_the_opening_make_nothing_old(bus):
             (scan,) = read_all(link, 16)
             assert scan.not_before_ns == scan.time_ns
         now_ns[0] += 9 * 10**9
-
-
-# Errors of the bus.
 
 
 @pytest.fixture
@@ -136,9 +130,6 @@ def test_a_bus_that_says_it_is_off(bus, monkeypatch):
     with link:
         link.read(0.0)
         assert link.trouble is None, "it began anew"
-
-
-# Opening.
 
 
 FILTERS = {"can_filters": [{"can_id": 0, "can_mask": 0, "extended": False}]}

@@ -99,9 +99,6 @@ def test_a_short_packet_ends_a_transfer():
         assert link.counters()["skipped_bytes"] == 13 and link.counters()["bus_off"] == 0
 
 
-# Opening and closing.
-
-
 def test_it_stops_what_it_started_and_gives_everything_back():
     port, link = opened()
     for kernel_driver in (True, False):

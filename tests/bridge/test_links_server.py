@@ -47,9 +47,6 @@ def test_a_server_with_no_sensor_that_fits_is_an_error():
         wait_for(lambda: not emulator.clients)
 
 
-# It goes, hangs and comes back.
-
-
 def test_it_is_told_why_a_server_closes_or_is_left():
     with looping() as server:
         link = XelaServerLink(server.url)
@@ -61,9 +58,6 @@ def test_it_is_told_why_a_server_closes_or_is_left():
         with link:
             server.say("x" * (LONGEST_MESSAGE_BYTES + 1))
             assert "too big" in lose(link)
-
-
-# Connecting.
 
 
 @contextlib.contextmanager

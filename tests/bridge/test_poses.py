@@ -79,9 +79,6 @@ def test_a_pose_that_is_not_later_is_not_taken():
     assert len(track) == MOST_POSES
 
 
-# Poses in recordings: written by the sinks, read back, and played to the runtime at the scans that they served.
-
-
 STEP_NS = 10_000_000
 POSES = [
     # Time, place and sensor; and the scan that was first made with it at hand, which may be earlier than its own time.

@@ -299,9 +299,6 @@ def test_files_that_cannot_be_read(tmp_path):
             load_recording(path)
 
 
-# Where a pad is free: its baseline, if the recording has none.
-
-
 def scans(*levels, noise_counts=3):
     """Return counts of (count, press) parts of a pad; a press is a number, one for each scan, or None: it grows."""
     rng, parts = np.random.default_rng(3), []

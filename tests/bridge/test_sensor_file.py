@@ -189,9 +189,6 @@ def test_numpys_numbers_are_written_and_a_silent_taxel_is_not(tmp_path):
     assert not (tmp_path / "t.toml").exists()
 
 
-# Files are whole or not there, and the one before is kept.
-
-
 def listing(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 

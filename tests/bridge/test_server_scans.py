@@ -136,9 +136,6 @@ def test_whatever_stands_in_a_key_is_borne(key, scrap, noise, place):
             assert reading.ups_hz is None or len(reading.ups_hz) == 16
 
 
-# Scans of the messages.
-
-
 class Server:
     """Server with messages and times of the test; arrivals are 2 ms after the sending."""
 

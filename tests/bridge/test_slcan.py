@@ -97,9 +97,6 @@ def test_the_form_of_lines_is_learnt_from_four_in_a_row(usual, other):
     assert (len(got), counters["bad_lines"]) == (4 + 2, few + 1)
 
 
-# Damaged lines: bytes that are changed, cut, lost or of noise.
-
-
 def test_every_byte_at_every_place_of_a_line():
     """One corrupted byte has no effect, loses the frame, or puts another digit in its place."""
     digits = b"0123456789ABCDEFabcdef"
