@@ -3,7 +3,7 @@
 import struct
 
 import pytest
-from bridge_samples import make_counts
+from bridge_samples import frames_of
 from gs_usb_emulator import CANDLELIGHT
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,10 +12,9 @@ from firmware_bridge.can import gs_usb
 from firmware_bridge.can.bus_errors import LOST_RECENTLY_NS, BusErrors
 from firmware_bridge.can.gs_usb import BitTimingLimits, GsUsbDecoder, HostFrame, bit_timing
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.scans.frame_scans import GsUsbScans
 
-SCAN = scan_frames(make_counts(1)[0], 4)
+SCAN = frames_of(1)
 
 
 def host_frame(frame, *, echo_id=0xFFFFFFFF, channel=0, flags=0, more_id=0, stamp_us=None, fd=False, dlc=None):
@@ -76,7 +75,6 @@ def test_requests_and_answers():
 
 
 def feed(decoder, stream, size):
-    """Return the frames of a stream that comes in pieces."""
     return [frame for at in range(0, len(stream), size) for frame in decoder.feed(stream[at : at + size])]
 
 

@@ -69,7 +69,6 @@ def test_stamps_that_count_from_the_opening_make_nothing_old(bus):
 
 @pytest.fixture
 def opens(monkeypatch):
-    """Function that sets what python-can opens."""
     return partial(monkeypatch.setattr, can, "Bus")
 
 

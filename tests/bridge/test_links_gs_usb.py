@@ -204,7 +204,6 @@ def test_one_without_permission_or_in_use():
 
 @pytest.fixture
 def get_backend(monkeypatch):
-    """Function that sets what pyusb takes for the system's libusb."""
     return partial(monkeypatch.setattr, libusb1, "get_backend")
 
 

@@ -185,7 +185,6 @@ def decoded(path):
 
 
 def test_public_readers_find_units_frames_and_marks(tmp_path):
-    """By the definitions in the file alone, as Foxglove and Rerun read it."""
     results = [replace(one, source="emulated") for one in make_results(odd_scans())]
     scans = [replace(one.scan, device_ns=one.scan.time_ns - 2_000_000) for one in results]
     results = [replace(one, scan=scan) for one, scan in zip(results, scans, strict=True)]

@@ -92,29 +92,20 @@ def test_a_map_in_place_and_a_scan_put_in_place_agree(mounting):
 
 @settings(max_examples=20, deadline=None)
 @given(mountings)
-def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
-    newtons = np.random.default_rng(1).normal(0, 1, (3, 4, 4)).astype(np.float32)
-    temperature_k, ups_hz = (np.arange(16, dtype=np.float32).reshape(4, 4) + base for base in (300, 80))
-    wire = replace(make_scan(absent=()), vendor=VendorReading(newtons, temperature_k, ups_hz))
-    put = mounting.place(wire)
-    assert np.array_equal(put.vendor.newtons, seen(mounting, newtons))
+def test_what_the_vendors_server_says_lies_and_points_as_the_pad_does(mounting):
+    newtons = np.random.default_rng(1).normal(0, 1, 48).tolist()
+    entry = sensor_entry(calibrated=newtons, temp=[300.0 + n for n in range(16)], ups=[80.0 + n for n in range(16)])
+    text = message(1, entry, sensor_entry())
+    (wire, other), (put, alike) = (ServerScans(mountings=known).feed(text, 0) for known in ({}, {"1": mounting}))
+    assert (put.counts.reshape(3, 16) == wire.counts.reshape(3, 16)[:, list(mounting.order)]).all()
+    assert np.array_equal(put.vendor.newtons, seen(mounting, wire.vendor.newtons))
     force_n = np.array(wire.vendor_force_n)[[1, 0, 2] if mounting.swap_xy else [0, 1, 2]] * mounting.signs
-    assert put.vendor_force_n == pytest.approx(force_n, abs=1e-5)
-    for told, was in ((put.vendor.temperature_k, temperature_k), (put.vendor.ups_hz, ups_hz)):
-        assert told is not None and np.array_equal(told.ravel(), was.ravel()[list(mounting.order)])
-    nothing = mounting.place(replace(wire, vendor=VendorReading())).vendor
-    assert nothing == VendorReading() and mounting.place(replace(wire, vendor=None)).vendor is None
-
-
-@pytest.mark.parametrize("mounting", [Mounting(swap_xy=True), Mounting(signs=(1, 1, -1)), TURNED])
-def test_forces_of_the_vendors_server_are_turned(mounting):
-    plain, turned = ServerScans(), ServerScans(mountings={"1": mounting})
-    text = message(1, sensor_entry(), sensor_entry())
-    expected, scans = plain.feed(text, 0), turned.feed(text, 0)
-    assert [scan.sensor for scan in ServerScans(prefix="left/").feed(text, 0)] == ["left/1", "left/2"]
-    assert scans[0].vendor_force_n == pytest.approx(mounting.place(expected[0]).vendor_force_n)
-    assert (scans[0].counts == mounting.place(expected[0]).counts).all()
-    assert scans[1].vendor_force_n == expected[1].vendor_force_n
+    assert put.vendor_force_n == pytest.approx(force_n, abs=1e-5) and alike.vendor_force_n == other.vendor_force_n
+    for name in ("temperature_k", "ups_hz"):
+        told, was = getattr(put.vendor, name), getattr(wire.vendor, name)
+        assert np.array_equal(told.ravel(), was.ravel()[list(mounting.order)])
+    for vendor in (VendorReading(), None):
+        assert mounting.place(replace(wire, vendor=vendor)).vendor == vendor
 
 
 def test_what_a_mounting_moves_and_what_costs_nothing():

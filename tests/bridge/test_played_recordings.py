@@ -20,7 +20,7 @@ from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.scan import ABSENT
-from firmware_bridge.schedule import NS_PER_S, Ticker, sleep_until
+from firmware_bridge.schedule import NS_PER_S, Ticker
 
 START_NS = 7_000_000_000
 MS = 1_000_000
@@ -31,7 +31,6 @@ class FakeTime:
 
     def __init__(self, *off_by_s: float) -> None:
         self.now_ns = START_NS
-        self.slept_s: list[float] = []
         self._off_by_s = list(off_by_s)
 
     def clock(self) -> int:
@@ -39,7 +38,6 @@ class FakeTime:
 
     def sleep(self, time_s: float) -> None:
         assert time_s > 0
-        self.slept_s.append(time_s)
         self.pass_s(time_s + (self._off_by_s.pop(0) if self._off_by_s else 0.0))
 
     def pass_s(self, time_s: float) -> None:
@@ -245,6 +243,7 @@ def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
     [  # each tick: the time worked before it, its number, and when it came, in [s]
         ((), [(0.0, 1, 0.01), (0.003, 2, 0.02), (0.0099, 3, 0.03)]),
         ((0.004,), [(0.0, 1, 0.014), (0.0, 2, 0.02)]),
+        ((-0.005, -0.002), [(0.0, 1, 0.01), (0.0, 2, 0.02)]),  # woken too soon, it sleeps again
         ((), [(0.0201, 2, 0.0201), (0.0, 3, 0.03)]),
         ((), [(0.0349, 3, 0.0349), (0.0, 4, 0.04)]),
     ],
@@ -256,10 +255,3 @@ def test_ticks_lie_on_the_grid_however_long_the_work_takes(off_by_s, ticks):
     for work_s, tick, at_s in ticks:
         time.pass_s(work_s)
         assert (ticker.wait(), time.now_ns - start_ns) == (tick, round(at_s * NS_PER_S))
-
-
-def test_sleeping_goes_on_until_the_deadline():
-    time = FakeTime(-0.5, -0.2)
-    assert sleep_until(time.now_ns + NS_PER_S, time.clock, time.sleep) == START_NS + NS_PER_S
-    assert sleep_until(0, time.clock, time.sleep) == START_NS + NS_PER_S
-    assert time.slept_s == pytest.approx([1.0, 0.5, 0.2])

@@ -94,12 +94,10 @@ def make_scans():
 
 
 def poses_of(number, scan):
-    """Return the poses that are first used for a scan."""
     return [replace(pose, used_from_ns=scan.time_ns) for pose, first in POSES if first == number]
 
 
 def record(path):
-    """Record scans and poses as a run would."""
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
     sink = McapSink(path, FakeModel().contract, fake_source(unix_offset_ns=OFFSET_NS))
     for number, scan in enumerate(make_scans()):
@@ -111,7 +109,6 @@ def record(path):
 
 
 def test_poses_are_played_at_the_scans_that_they_served_again(tmp_path):
-    """Also by a recording of a replay."""
     expected = [one for number, scan in enumerate(make_scans()) for one in (*poses_of(number, scan), scan.time_ns)]
     path = record(tmp_path / "0.mcap")
     for again in ("1.mcap", "2.mcap"):

@@ -25,7 +25,6 @@ def cycle(number: int, sensor: str = "4") -> list[Reading]:
 
 
 def feed_all(assembler: ScanAssembler, readings: list[Reading], time_ns: int, *stamps) -> list[Scan]:
-    """Feed readings of one moment together."""
     return assembler.feed(Readings(*zip(*readings, strict=True)), time_ns, *stamps)
 
 

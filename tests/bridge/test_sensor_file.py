@@ -34,7 +34,7 @@ def test_what_is_written_is_read(tmp_path):
     entries = {
         name: SensorEntry(
             Mounting(tuple(np.random.default_rng(number).permutation(16).tolist()), number % 2 == 0, (1, -1, 1)),
-            1e6 / 3 if number else None,
+            np.float64(1e6) / 3 if number else None,
             baseline(name, (1, 1.5, 1.7e9)[number % 3]) if number != 1 else None,
             (None, Pad(**constants, intervals=intervals), Pad(gains=GAINS, gain_half_widths=WIDTHS))[number % 3],
             frame=place if number == 2 else PadFrame("tool0"),
@@ -178,9 +178,7 @@ def test_of_gains_by_hand_and_learned_the_surer_are_used(by_hand, by_itself, use
     assert read.pads["4"].intervals == {"poisson": (0.41, 0.43)}
 
 
-def test_numpys_numbers_are_written_and_a_silent_taxel_is_not(tmp_path):
-    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(counts_per_newton=np.float64(1180.0))}))
-    assert load_sensor_file(tmp_path / "s.toml").sensors["4"].counts_per_newton == 1180.0
+def test_a_baseline_without_a_taxel_is_not_written(tmp_path):
     rest = np.full((3, 4, 4), 16_000.0)
     rest[:, 1, 2] = np.nan
     silent = Baseline.of("4", rest, 1.7e9, 100, "file")
@@ -198,7 +196,7 @@ def written(path: Path, text: str, **settings) -> None:
 
 
 def test_a_new_file_has_its_name_and_the_one_before_is_kept(tmp_path):
-    path, drafts = tmp_path / "a.json", []
+    path = tmp_path / "a.json"
     written(path, "1")
     assert path.read_text() == "1" and listing(tmp_path) == ["a.json"]
     for text in "23":
@@ -206,8 +204,6 @@ def test_a_new_file_has_its_name_and_the_one_before_is_kept(tmp_path):
     assert path.read_text() == "3" and (tmp_path / "a.json.bak").read_text() == "2"
     written(path, "4", keep_before=False)
     assert (tmp_path / "a.json.bak").read_text() == "2" and listing(tmp_path) == ["a.json", "a.json.bak"]
-    write_in_place(path, lambda draft: (drafts.append(draft), draft.touch()), drafts.append)
-    assert drafts[0] == drafts[1] and drafts[0].name == "a.json" and drafts[0].parent.parent == tmp_path
 
 
 def broken(draft: Path) -> None:

@@ -68,7 +68,6 @@ def messages_of(path: Path) -> dict[str, list]:
 
 
 def content(scan: Scan) -> list:
-    """Return all that a scan holds, bit for bit."""
     vendor = [getattr(scan.vendor, name, None) for name in ("newtons", "temperature_k", "ups_hz")]
     arrays = [scan.counts, scan.fresh, scan.renewed, *vendor]
     return [scan.sensor, scan.number, scan.time_ns, scan.device_ns, *(a if a is None else a.tobytes() for a in arrays)]
