@@ -65,12 +65,6 @@ def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
         assert reader.read(0, 1) == (b"", 3 * half_s, 3 * half_s)
 
 
-def test_a_pseudo_terminal_is_known_behind_a_link(tmp_path):
-    (tmp_path / "ttyUSB0").symlink_to("/dev/pts/0")
-    assert SlcanSerialLink(str(tmp_path / "ttyUSB0")).kind == "emulated"
-    assert SlcanSerialLink("/dev/ttyUSB0").kind == "device"
-
-
 def test_what_lies_there_at_an_opening_or_at_the_end_is_dropped():
     """A client that was killed leaves the channel open, and the kernel keeps what it did not read."""
     line = encode_frame(CanFrame(0x401, bytes(8)))
@@ -90,14 +84,6 @@ def test_what_lies_there_at_an_opening_or_at_the_end_is_dropped():
             os.write(device.device_fd, 3 * line)
         assert link.counters()["dropped_bytes"] == 5 * len(line), "and counted, but for what lay there before"
         assert link.counters()["frames"] == link.counters()["received_bytes"] == 0
-
-
-def test_a_slow_line_carries_no_time_stamps():
-    """Nothing before, between and after the commands: an empty one is refused by some adapters."""
-    with SilentDevice() as device:
-        with SlcanSerialLink(device.port, 921_600):
-            pass
-        assert device.received(9) == b"C\rS8\rO\rC\r"
 
 
 def fill(port_fd: int) -> None:
@@ -137,15 +123,22 @@ def test_a_stream_that_will_not_stop_holds_up_no_opening(limits):
             thread.join()
 
 
-def test_speed_flow_control_and_low_latency_are_asked_for(monkeypatch):
+@pytest.mark.parametrize(
+    ("settings", "speed", "commands"),
+    [
+        ((), termios.B3000000, b"C\rS8\rZ1\rO\rC\rZ0\r"),
+        ((921_600,), termios.B921600, b"C\rS8\rO\rC\r"),  # a slow line carries no time stamps
+    ],
+)
+def test_what_is_asked_of_the_port_and_the_adapter(monkeypatch, settings, speed, commands):
+    """Nothing before, between and after the commands: an empty one is refused by some adapters."""
     asked = []
     monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda port, on: asked.append(on))
     with SilentDevice() as device:
-        for settings, speed in (((), termios.B3000000), ((115_200,), termios.B115200)):
-            with SlcanSerialLink(device.port, *settings):
-                attributes = termios.tcgetattr(device.client_fd)
-                assert attributes[2] & termios.CRTSCTS and attributes[4:6] == [speed, speed]
-    assert asked == [True, True]
+        with SlcanSerialLink(device.port, *settings):
+            attributes = termios.tcgetattr(device.client_fd)
+        assert attributes[2] & termios.CRTSCTS and attributes[4:6] == [speed, speed] and asked == [True]
+        assert device.received(len(commands)) == commands
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def test_what_is_written_is_read(tmp_path):
     entries = {
         name: SensorEntry(
             Mounting(tuple(np.random.default_rng(number).permutation(16).tolist()), number % 2 == 0, (1, -1, 1)),
-            np.float64(1e6) / 3 if number else None,
+            np.float32(1e6) / 3 if number else None,
             baseline(name, (1, 1.5, 1.7e9)[number % 3]) if number != 1 else None,
             (None, Pad(**constants, intervals=intervals), Pad(gains=GAINS, gain_half_widths=WIDTHS))[number % 3],
             frame=place if number == 2 else PadFrame("tool0"),
