@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_npz, write_recording
-from edge_samples import FakeModel, make_scan
+from edge_samples import Clock, FakeModel, make_scan
 from mcap_samples import SURE
 
 from edge.api import Event, Stream, infer, open_recording, open_runtime
@@ -26,15 +26,12 @@ START_NS = 7_000_000_000
 MS = 1_000_000
 
 
-class FakeTime:
+class FakeTime(Clock):
     """A clock that only sleeping moves on, later or earlier than asked for."""
 
     def __init__(self, *off_by_s: float) -> None:
         self.now_ns = START_NS
         self._off_by_s = list(off_by_s)
-
-    def clock(self) -> int:
-        return self.now_ns
 
     def sleep(self, time_s: float) -> None:
         assert time_s > 0
@@ -45,7 +42,7 @@ class FakeTime:
 
 
 def replay(time: FakeTime, *paths, **options) -> ReplayLink:
-    return ReplayLink(paths, clock=time.clock, sleep=time.sleep, **options)
+    return ReplayLink(paths, clock=time, sleep=time.sleep, **options)
 
 
 def test_waiting_ends_with_the_timeout_and_who_is_late_gets_all(tmp_path):
@@ -250,7 +247,7 @@ def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
 )
 def test_ticks_lie_on_the_grid_however_long_the_work_takes(off_by_s, ticks):
     time = FakeTime(*off_by_s)
-    ticker = Ticker(100, time.clock, time.sleep)
+    ticker = Ticker(100, time, time.sleep)
     start_ns = time.now_ns
     for work_s, tick, at_s in ticks:
         time.pass_s(work_s)

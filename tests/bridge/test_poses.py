@@ -23,16 +23,11 @@ from firmware_bridge.recording.scan_messages import POSE, decode_pose, encode_po
 MS = 1_000_000
 
 
-def turned(turn_deg):
-    turn = np.radians(turn_deg)
-    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-
-
 def test_a_pose_seen_from_another_gives_the_place_again():
     newest, earlier = PadPose(12.0, -3.0, 100.0), PadPose(13.5, -1.0, -170.0)
     seen = earlier.seen_from(newest)
-    back = turned(newest.turn_deg) @ (seen.x_mm, seen.y_mm) + (newest.x_mm, newest.y_mm)
-    assert back == pytest.approx([13.5, -1.0]) and seen.turn_deg == pytest.approx(90.0)
+    place = complex(12.0, -3.0) + complex(seen.x_mm, seen.y_mm) * np.exp(1j * np.radians(100.0))
+    assert (place.real, place.imag) == pytest.approx((13.5, -1.0)) and seen.turn_deg == pytest.approx(90.0)
     assert seen.error_mm == pytest.approx(np.hypot(0.2, 0.2)) and seen.error_deg == pytest.approx(np.hypot(1, 1))
 
 

@@ -20,13 +20,9 @@ GAINS = tuple(np.random.default_rng(0).uniform(0.01, 100, 48).tolist())
 WIDTHS = tuple(np.random.default_rng(1).uniform(0, 1, 48).tolist())
 
 
-def baseline(sensor, created_unix_s):
-    counts = np.random.default_rng(2).uniform(0, 65_535, (3, 4, 4))
-    return Baseline.of(sensor, counts, created_unix_s, 100, "file")
-
-
 def test_what_is_written_is_read(tmp_path):
     """Names of any printable characters, numbers with every digit, and each part with and without what may be in it."""
+    counts = np.random.default_rng(2).uniform(0, 65_535, (3, 4, 4))
     constants = {name: low + (high - low) / 3 for name, (low, high) in PAD_RANGES.items()}
     intervals = {name: (PAD_RANGES[name][0], value) for name, value in constants.items()}
     place = PadFrame("left/finger_tip", (-1e5, 0.1, 1 / 3), (0.0, 0.6, 0.8, 0.0))
@@ -35,7 +31,7 @@ def test_what_is_written_is_read(tmp_path):
         name: SensorEntry(
             Mounting(tuple(np.random.default_rng(number).permutation(16).tolist()), number % 2 == 0, (1, -1, 1)),
             np.float32(1e6) / 3 if number else None,
-            baseline(name, (1, 1.5, 1.7e9)[number % 3]) if number != 1 else None,
+            Baseline.of(name, counts, (1, 1.5, 1.7e9)[number % 3], 100, "file") if number != 1 else None,
             (None, Pad(**constants, intervals=intervals), Pad(gains=GAINS, gain_half_widths=WIDTHS))[number % 3],
             frame=place if number == 2 else PadFrame("tool0"),
             counts_per_newton_interval=(1e-3, 1e6) if number > 1 else None,
