@@ -216,7 +216,6 @@ WRONG = {
     ],
     "id": ["00000000", None],  # as where the counts were changed
 }
-"""Values that cannot be, by key."""
 
 
 @pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in WRONG.items() for value in values])

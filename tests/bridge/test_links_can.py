@@ -30,10 +30,6 @@ def link_to(bus, **settings):
     return CanBusLink("virtual", bus.channel_id, **settings)
 
 
-def read_all(link, messages):
-    return [scan for _ in range(messages) for scan in link.read(0.0)]
-
-
 def error_message(classes, *data):
     return can.Message(arbitration_id=classes, data=bytes(data), is_error_frame=True, is_extended_id=False)
 
@@ -47,7 +43,7 @@ def test_frames_without_stamps_frames_of_fd_and_unknown_errors(bus):
     with link_to(bus, clock_ns=now_ns.__next__) as link:
         for message in (message_of(frames_of(1)[0], is_fd=True), BUS_OFF, *map(message_of, frames_of(1))):
             bus.send(message)
-        (scan,) = read_all(link, 18)
+        (scan,) = (scan for _ in range(18) for scan in link.read(0.0))
         assert scan.complete and scan.device_ns is None
         counters = link.counters()
         assert (counters["fd_frames"], counters["readings"]) == (1, 16)
@@ -62,7 +58,7 @@ def test_stamps_that_count_from_the_opening_make_nothing_old(bus):
         with link:
             for frame in frames_of(1, seed=opened_us):
                 bus.send(message_of(frame, timestamp=opened_us / 1e6))
-            (scan,) = read_all(link, 16)
+            (scan,) = (scan for _ in range(16) for scan in link.read(0.0))
             assert scan.not_before_ns == scan.time_ns
         now_ns[0] += 9 * 10**9
 

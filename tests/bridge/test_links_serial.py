@@ -18,7 +18,6 @@ from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.slcan_serial import BUS_ERRORS, PortReader, SlcanSerialLink
-from firmware_bridge.scans.slcan_scans import SlcanScans
 
 MS = 1_000_000
 
@@ -185,13 +184,6 @@ def test_an_adapter_that_goes_while_it_is_opened_or_closed(monkeypatch, error):
             monkeypatch.setattr(serial.Serial, "write", fail)
         with pytest.raises(DeviceError):
             link.__enter__()
-
-
-def test_stamps_count_from_zero_again_each_minute():
-    scans, at_ms = SlcanScans(), ((59_800, 0), (59_900, 100), (100, 340))  # the last of them is read late
-    first, second, third = (scans.feed(b"".join(cycle_lines(1, ms)), 10**12 + read * MS)[0] for ms, read in at_ms)
-    assert first.device_ns is not None and second.device_ns == first.device_ns + 100 * MS
-    assert third.device_ns == first.device_ns + 300 * MS
 
 
 LATE = cycle_lines(0, 0)[0][:-5] + b"FA00\r"  # no milliseconds of a minute

@@ -187,7 +187,7 @@ def test_it_plays_through_and_ends_or_begins_again(recording, loop, rate_hz, rou
     assert len(scans) == (75 if loop else 30)
 
 
-def test_an_early_end_or_a_port_that_fails_leaves_no_emulator(recording, monkeypatch):
+def test_an_early_end_or_a_port_that_fails_leaves_no_emulator(recording, tmp_path, monkeypatch):
     def refuse(link):
         raise DeviceError("no port")
 
@@ -197,12 +197,9 @@ def test_an_early_end_or_a_port_that_fails_leaves_no_emulator(recording, monkeyp
     monkeypatch.setattr(SlcanSerialLink, "__enter__", refuse)
     with pytest.raises(DeviceError, match="no port"):
         DemoLink(recording).__enter__()
-    assert (threading.active_count(), len(list(Path("/proc/self/fd").iterdir()))) == before
-
-
-def test_a_recording_that_cannot_be_played(tmp_path):
     with pytest.raises(DeviceError, match=r"^the emulator did not start: .*--rate-hz"):
         DemoLink(write_recording(tmp_path / "a.csv", make_counts(1))).__enter__()
+    assert (threading.active_count(), len(list(Path("/proc/self/fd").iterdir()))) == before
 
 
 # The controller and the adapter that are emulated: their frames, times and answers, on a pseudo-terminal as well.
