@@ -53,8 +53,8 @@ def zeroed(counts: np.ndarray, estimator: BaselineEstimator | None = None, silen
     return baseline
 
 
-def of(counts: np.ndarray) -> Baseline:
-    return Baseline.of("4", counts, 1000.0, 100, "file")
+def made(counts: np.ndarray = REST, sensor: str = "4", created_unix_s: float = 1_000.0) -> Baseline:
+    return Baseline.of(sensor, counts, created_unix_s, 100, "start-up")
 
 
 def test_a_still_pad_gives_its_median():
@@ -71,6 +71,10 @@ def test_a_still_pad_gives_its_median():
     assert baseline.age_s(1300.0) == 65.5 and estimator.scans == 0
     for seed in range(1, 40):
         zeroed(still(100, seed, noise_counts=(2.8, 2.8, 4.7)))  # the loudest pad on record
+    for rest in (0, 443, 65_535, 32_768):  # round the circle of counts
+        counts = zeroed(still(100, rest=np.full((3, 4, 4), rest))).counts
+        assert abs((counts - rest + 32_768) % 65_536 - 32_768).max() < 2.5
+        assert counts.min() >= 0 and counts.max() < 65_536
     with pytest.raises(ValueError, match="at least 3"):
         BaselineEstimator(min_scans=2)
 
@@ -123,14 +127,6 @@ def test_torn_and_repeated_scans_are_no_samples():
     zeroed(np.stack([counts[0], gap, counts[1], counts[1], counts[1], counts[2]]), BaselineEstimator(min_scans=3))
 
 
-@pytest.mark.parametrize("rest", [0, 443, 65_535, 32_768])
-def test_zeroing_goes_round_the_circle(rest):
-    baseline = zeroed(still(100, rest=np.full((3, 4, 4), rest)))
-    off = (baseline.counts - rest + 32_768) % 65_536 - 32_768
-    assert abs(off).max() < 2.5
-    assert baseline.counts.min() >= 0 and baseline.counts.max() < 65_536
-
-
 @given(st.integers(0, 65_535), st.integers(-32_767, 32_767), st.sampled_from((0, 0.5)), st.booleans())
 @settings(deadline=None)
 def test_deformation_is_the_short_way_round(rest, pressed, half, unknown):
@@ -139,7 +135,7 @@ def test_deformation_is_the_short_way_round(rest, pressed, half, unknown):
     scan[:, 1, 3] = ABSENT
     counts = np.full((3, 4, 4), (rest - half) % 65_536, dtype=np.float64)
     counts[:, 0, 0] = np.nan if unknown else counts[0, 1, 1]
-    seen = deformation(scan, of(counts))
+    seen = deformation(scan, made(counts))
     gaps = np.zeros((4, 4), dtype=bool)
     gaps[1, 3], gaps[0, 0] = True, unknown
     assert seen.dtype == np.float32 and (np.isnan(seen) == gaps).all()
@@ -165,10 +161,6 @@ def test_a_taxel_given_up_has_no_rest_until_the_next_zeroing():
 # Files: saved, loaded, written by hand and refused.
 
 
-def made(counts: np.ndarray = REST, sensor: str = "4", created_unix_s: float = 1_000.0) -> Baseline:
-    return Baseline.of(sensor, counts, created_unix_s, 100, "start-up")
-
-
 def with_cell(cell: object) -> list:
     counts: list = REST.tolist()
     counts[1][2][3] = cell
@@ -186,7 +178,6 @@ def test_the_id_is_of_sensor_counts_and_time_not_of_drift():
 def test_saved_baselines_come_back(tmp_path):
     path = tmp_path / "zero.json"
     saved = [made(), made(REST + 0.5, "6", 123.456), made(sensor="8", created_unix_s=float("nan"))]
-    path.write_text("old")
     save_baselines(str(path), saved)
     loaded = load_baselines(str(path))
     assert list(loaded) == ["4", "6", "8"]
@@ -194,16 +185,8 @@ def test_saved_baselines_come_back(tmp_path):
         assert (got.counts == baseline.counts).all() and (got.id, got.scans) == (baseline.id, 100)
         np.testing.assert_equal(got.created_unix_s, baseline.created_unix_s)
         assert got.origin == "file"
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["zero.json", "zero.json.bak"]
-    assert (tmp_path / "zero.json.bak").read_text() == "old"
-
-
-def test_a_baseline_of_another_order_of_taxels_is_refused(tmp_path):
-    orders = {"4": tuple(reversed(range(16)))}
-    save_baselines(tmp_path / "zero.json", [made()], orders)
-    assert list(load_baselines(tmp_path / "zero.json", orders)) == ["4"]
-    with pytest.raises(RecordingError, match="the taxels of sensor 4 lay in another order"):
-        load_baselines(tmp_path / "zero.json")
+    with pytest.raises(RecordingError, match=r"none/zero\.json: cannot be written: "):
+        save_baselines(tmp_path / "none" / "zero.json", saved)
 
 
 @pytest.mark.parametrize(
@@ -217,14 +200,6 @@ def test_a_baseline_written_by_hand_as_the_docs_say_needs_no_id(tmp_path, cell, 
     baseline = load_baselines(path)["4"]
     assert baseline.counts[1, 2, 3] == np.float32(cell) and baseline.scans == scans
     np.testing.assert_equal(baseline.created_unix_s, created_unix_s)
-
-
-def test_saving_where_nothing_can_be_written(tmp_path):
-    (tmp_path / "folder").mkdir()
-    for path in (tmp_path / "no" / "zero.json", tmp_path / "folder"):
-        with pytest.raises(RecordingError, match=rf"{path.name}: cannot be written: "):
-            save_baselines(path, [made()])
-    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
 
 
 ENTRY = {"sensor": "4", "created_unix_s": 1_000.0, "scans": 100, "counts": REST.tolist()}
@@ -241,7 +216,6 @@ WRONG = {
     ],
     "id": ["00000000", None],  # as where the counts were changed
 }
-"""Values that cannot be, by key."""
 
 
 @pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in WRONG.items() for value in values])

@@ -72,8 +72,6 @@ SETTLED = [False] * 5
 
 
 class Blocks:
-    """A tracker, and whole blocks of scans for it."""
-
     def __init__(self, baseline=BASELINE, dead=NONE_DEAD):
         self.tracker = DriftTracker(baseline)
         self.time_ns = 7_000_000_000

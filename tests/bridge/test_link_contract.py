@@ -96,37 +96,28 @@ def test_pulled_out_it_is_lost_at_once_and_every_time(rig):
 
 
 @of(THAT_COME_BACK)
-def test_it_is_opened_again_once_it_is_back_and_numbers_go_on(rig):
-    link, numbers = rig.link(), []
-    for _ in range(3):
-        with link:
-            numbers += [scan.number for scan in rig.give(link, 3)]
-            rig.lose()
-        for _ in range(2):
-            with pytest.raises(DeviceError, match=rig.away) as refused:
-                link.__enter__()
-            assert "\n" not in str(refused.value) and not isinstance(refused.value, LinkLostError)
-        rig.put_back()
-    assert numbers == sorted(set(numbers)) and link.counters()["scans"] == len(numbers) >= 9
-
-
-@of(THAT_COME_BACK)
 def test_it_comes_back_by_itself_under_the_name_of_its_sensors(rig):
     with LinkReader(rig.link(prefix="finger/"), math.inf) as link:
-        scans, notices, end_s = rig.give(link, 2), [], time.monotonic() + 60
-        rig.lose()
-        while not link.counters()["outages"]:
-            scans += link.read(0.05)
-        rig.put_back()
-        while not link.counters()["reopenings"]:
-            assert link.read(0.05) == [] and time.monotonic() < end_s
-        scans += rig.give(link, 2)
-        notices += link.notices()
+        scans, end_s = rig.give(link, 2), time.monotonic() + 60
+        for outages in (1, 2):
+            rig.lose()
+            while link.counters()["outages"] < outages:
+                scans += link.read(0.05)
+            with pytest.raises(DeviceError, match=rig.away) as refused:
+                rig.link().__enter__()
+            assert "\n" not in str(refused.value) and not isinstance(refused.value, LinkLostError)
+            rig.put_back()
+            while link.counters()["reopenings"] < outages:
+                assert link.read(0.05) == [] and time.monotonic() < end_s
+            scans += rig.give(link, 2)
+        notices, counters = link.notices(), link.counters()
         assert link.link.can_ids() == (set() if rig.sensor == "1" else {frame.can_id for frame in frames_of(1)})
+    numbers = [scan.number for scan in scans]
+    assert numbers == sorted(set(numbers)) and counters["scans"] == len(scans)
     assert {scan.sensor for scan in scans} == {f"finger/{rig.sensor}"}
-    assert [(notice.kind, notice.sensors) for notice in notices] == [("lost", "finger/"), ("back", "finger/")]
+    assert [(notice.kind, notice.sensors) for notice in notices] == [("lost", "finger/"), ("back", "finger/")] * 2
     assert all(notice.text.startswith("finger: ") and "\n" not in notice.text for notice in notices)
-    assert (link.counters()["outages"], link.counters()["reopenings"]) == (1, 1)
+    assert (counters["outages"], counters["reopenings"]) == (2, 2)
 
 
 @pytest.mark.parametrize(
@@ -153,9 +144,6 @@ def test_counters_are_of_whole_steps(rig, step, monkeypatch):
         rig.give(link, 1)
     asked[0].join()
     assert early == [False], "it was answered in the middle"
-
-
-# Links that see the frames themselves.
 
 
 @of(CAN)

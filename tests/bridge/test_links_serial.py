@@ -18,7 +18,8 @@ from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.slcan_serial import BUS_ERRORS, PortReader, SlcanSerialLink
-from firmware_bridge.scans.slcan_scans import SlcanScans
+
+MS = 1_000_000
 
 
 def test_what_came_before_the_loss_is_not_lost(monkeypatch):
@@ -43,9 +44,6 @@ def test_what_came_before_the_loss_is_not_lost(monkeypatch):
     assert got == ([], 1, 1)
 
 
-# The reader of the port.
-
-
 def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
     """Otherwise bytes that arrive meanwhile would look new."""
     now_ns, half_s, read = [0], 500_000_000, os.read
@@ -64,15 +62,6 @@ def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
         os.write(device.device_fd, b"z\r")
         assert reader.read(0, 1) == (b"z\r", 3 * half_s, half_s), "they may have come at once"
         assert reader.read(0, 1) == (b"", 3 * half_s, 3 * half_s)
-
-
-# Opening and closing.
-
-
-def test_a_pseudo_terminal_is_known_behind_a_link(tmp_path):
-    (tmp_path / "ttyUSB0").symlink_to("/dev/pts/0")
-    assert SlcanSerialLink(str(tmp_path / "ttyUSB0")).kind == "emulated"
-    assert SlcanSerialLink("/dev/ttyUSB0").kind == "device"
 
 
 def test_what_lies_there_at_an_opening_or_at_the_end_is_dropped():
@@ -94,14 +83,6 @@ def test_what_lies_there_at_an_opening_or_at_the_end_is_dropped():
             os.write(device.device_fd, 3 * line)
         assert link.counters()["dropped_bytes"] == 5 * len(line), "and counted, but for what lay there before"
         assert link.counters()["frames"] == link.counters()["received_bytes"] == 0
-
-
-def test_a_slow_line_carries_no_time_stamps():
-    """Nothing before, between and after the commands: an empty one is refused by some adapters."""
-    with SilentDevice() as device:
-        with SlcanSerialLink(device.port, 921_600) as link:
-            assert link.read(0.0) == []
-        assert device.received(9) == b"C\rS8\rO\rC\r"
 
 
 def fill(port_fd: int) -> None:
@@ -141,15 +122,22 @@ def test_a_stream_that_will_not_stop_holds_up_no_opening(limits):
             thread.join()
 
 
-def test_speed_flow_control_and_low_latency_are_asked_for(monkeypatch):
+@pytest.mark.parametrize(
+    ("settings", "speed", "commands"),
+    [
+        ((), termios.B3000000, b"C\rS8\rZ1\rO\rC\rZ0\r"),
+        ((921_600,), termios.B921600, b"C\rS8\rO\rC\r"),  # a slow line carries no time stamps
+    ],
+)
+def test_what_is_asked_of_the_port_and_the_adapter(monkeypatch, settings, speed, commands):
+    """Nothing before, between and after the commands: an empty one is refused by some adapters."""
     asked = []
     monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda port, on: asked.append(on))
     with SilentDevice() as device:
-        for settings, speed in (((), termios.B3000000), ((115_200,), termios.B115200)):
-            with SlcanSerialLink(device.port, *settings):
-                attributes = termios.tcgetattr(device.client_fd)
-                assert attributes[2] & termios.CRTSCTS and attributes[4:6] == [speed, speed]
-    assert asked == [True, True]
+        with SlcanSerialLink(device.port, *settings):
+            attributes = termios.tcgetattr(device.client_fd)
+        assert attributes[2] & termios.CRTSCTS and attributes[4:6] == [speed, speed] and asked == [True]
+        assert device.received(len(commands)) == commands
 
 
 @pytest.mark.parametrize(
@@ -198,35 +186,6 @@ def test_an_adapter_that_goes_while_it_is_opened_or_closed(monkeypatch, error):
             link.__enter__()
 
 
-MS = 1_000_000
-
-
-# Time stamps.
-
-
-@pytest.mark.parametrize("cut", [1, 100, 1000])
-def test_any_chunking_gives_the_same_times(cut):
-    """The frames of two sensors mix, so that no cycle is whole; frames that came in time set the clock first."""
-    lines = [line for n in range(9) for line in cycle_lines(n, 110 + 10 * n)]
-    mixed = [one for line in lines for one in (line, line[:3] + b"6" + line[4:])]
-    for text in (b"".join(lines), b"".join(mixed)):
-        whole, pieces = SlcanScans(), SlcanScans()
-        for scans in (whole, pieces):
-            scans.feed(b"".join(cycle_lines(0, 100)), 10**12 - 10**9)
-        expected = whole.feed(text, 10**12)
-        got = [scan for at in range(0, len(text), cut) for scan in pieces.feed(text[at : at + cut], 10**12)]
-        assert [scan.device_ns for scan in got] == [scan.device_ns for scan in expected]
-        assert {scan.device_ns for scan in got} == {10**12 - 10**9 + (10 + 10 * n) * MS for n in range(9)}
-        assert whole.counters() == pieces.counters()
-
-
-def test_stamps_count_from_zero_again_each_minute():
-    scans, at_ms = SlcanScans(), ((59_800, 0), (59_900, 100), (100, 340))  # the last of them is read late
-    first, second, third = (scans.feed(b"".join(cycle_lines(1, ms)), 10**12 + read * MS)[0] for ms, read in at_ms)
-    assert first.device_ns is not None and second.device_ns == first.device_ns + 100 * MS
-    assert third.device_ns == first.device_ns + 300 * MS
-
-
 LATE = cycle_lines(0, 0)[0][:-5] + b"FA00\r"  # no milliseconds of a minute
 
 
@@ -250,9 +209,6 @@ def test_stamps_that_stand_still_are_left_out(text, limits):
         with link:
             pass
         assert device.received(9) == b"C\rS8\rO\rC\r"
-
-
-# Status.
 
 
 def test_a_silent_bus_with_errors_is_trouble(limits):

@@ -32,22 +32,16 @@ def test_every_scan_comes_once_and_in_order():
     assert counters == {"messages": 31, "welcomes": 1, "scans": 60}
 
 
-def test_sensors_of_other_shapes_are_left_out():
+def test_sensors_of_other_shapes_are_left_out_and_one_must_fit():
     with looping(others=[("uSPa46", 24)]) as server, XelaServerLink(server.url) as link:
         assert {scan.sensor for scan in read_scans(link, 5)} == {"1"}
         assert link.trouble == "sensor 2 is left out: 'uSPa46' with 24 taxels, expected 16"
-
-
-def test_a_server_with_no_sensor_that_fits_is_an_error():
-    with ServerEmulator([], others=[("uSPa46", 24)], loop=True) as emulator:
+    with ServerEmulator([], others=[("uSPa46", 24)], loop=True) as server:
         words = "no sensor that can be used: sensor 1 is left out: 'uSPa46'"
-        with pytest.raises(DeviceError, match=words) as refused, XelaServerLink(emulator.url) as link:
+        with pytest.raises(DeviceError, match=words) as refused, XelaServerLink(server.url) as link:
             read_scans(link, 1)
-        assert not isinstance(refused.value, LinkLostError)  # another try would not help
-        wait_for(lambda: not emulator.clients)
-
-
-# It goes, hangs and comes back.
+        assert not isinstance(refused.value, LinkLostError), "another try would not help"
+        wait_for(lambda: not server.clients)
 
 
 def test_it_is_told_why_a_server_closes_or_is_left():
@@ -61,9 +55,6 @@ def test_it_is_told_why_a_server_closes_or_is_left():
         with link:
             server.say("x" * (LONGEST_MESSAGE_BYTES + 1))
             assert "too big" in lose(link)
-
-
-# Connecting.
 
 
 @contextlib.contextmanager

@@ -4,9 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bridge_samples import write_recording as write_csv
-from cli_samples import write_recording as write_npz
-from edge_samples import BASELINE, make_scan
+from edge_samples import make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from xela_server_emulator import message, sensor_entry
@@ -15,12 +13,11 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.recording.csv_reader import csv_header
-from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP, XR1944_MAP
+from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP, XR1944_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting, placed_map
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.xela_server_scans import ServerScans
-from firmware_bridge.zeroing.baseline import deformation
 
 BACKWARDS = [3, 2, 1, 0]
 
@@ -95,29 +92,20 @@ def test_a_map_in_place_and_a_scan_put_in_place_agree(mounting):
 
 @settings(max_examples=20, deadline=None)
 @given(mountings)
-def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
-    newtons = np.random.default_rng(1).normal(0, 1, (3, 4, 4)).astype(np.float32)
-    temperature_k, ups_hz = (np.arange(16, dtype=np.float32).reshape(4, 4) + base for base in (300, 80))
-    wire = replace(make_scan(absent=()), vendor=VendorReading(newtons, temperature_k, ups_hz))
-    put = mounting.place(wire)
-    assert np.array_equal(put.vendor.newtons, seen(mounting, newtons))
+def test_what_the_vendors_server_says_lies_and_points_as_the_pad_does(mounting):
+    newtons = np.random.default_rng(1).normal(0, 1, 48).tolist()
+    entry = sensor_entry(calibrated=newtons, temp=[300.0 + n for n in range(16)], ups=[80.0 + n for n in range(16)])
+    text = message(1, entry, sensor_entry())
+    (wire, other), (put, alike) = (ServerScans(mountings=known).feed(text, 0) for known in ({}, {"1": mounting}))
+    assert (put.counts.reshape(3, 16) == wire.counts.reshape(3, 16)[:, list(mounting.order)]).all()
+    assert np.array_equal(put.vendor.newtons, seen(mounting, wire.vendor.newtons))
     force_n = np.array(wire.vendor_force_n)[[1, 0, 2] if mounting.swap_xy else [0, 1, 2]] * mounting.signs
-    assert put.vendor_force_n == pytest.approx(force_n, abs=1e-5)
-    for told, was in ((put.vendor.temperature_k, temperature_k), (put.vendor.ups_hz, ups_hz)):
-        assert told is not None and np.array_equal(told.ravel(), was.ravel()[list(mounting.order)])
-    nothing = mounting.place(replace(wire, vendor=VendorReading())).vendor
-    assert nothing == VendorReading() and mounting.place(replace(wire, vendor=None)).vendor is None
-
-
-@pytest.mark.parametrize("mounting", [Mounting(swap_xy=True), Mounting(signs=(1, 1, -1)), TURNED])
-def test_forces_of_the_vendors_server_are_turned(mounting):
-    plain, turned = ServerScans(), ServerScans(mountings={"1": mounting})
-    text = message(1, sensor_entry(), sensor_entry())
-    expected, scans = plain.feed(text, 0), turned.feed(text, 0)
-    assert [scan.sensor for scan in ServerScans(prefix="left/").feed(text, 0)] == ["left/1", "left/2"]
-    assert scans[0].vendor_force_n == pytest.approx(mounting.place(expected[0]).vendor_force_n)
-    assert (scans[0].counts == mounting.place(expected[0]).counts).all()
-    assert scans[1].vendor_force_n == expected[1].vendor_force_n
+    assert put.vendor_force_n == pytest.approx(force_n, abs=1e-5) and alike.vendor_force_n == other.vendor_force_n
+    for name in ("temperature_k", "ups_hz"):
+        told, was = getattr(put.vendor, name), getattr(wire.vendor, name)
+        assert np.array_equal(told.ravel(), was.ravel()[list(mounting.order)])
+    for vendor in (VendorReading(), None):
+        assert mounting.place(replace(wire, vendor=vendor)).vendor == vendor
 
 
 def test_what_a_mounting_moves_and_what_costs_nothing():
@@ -126,13 +114,6 @@ def test_what_a_mounting_moves_and_what_costs_nothing():
     assert not Mounting().turns_axes and not Mounting().moves_taxels
     assert Mounting(signs=(1, 1, -1)).turns_axes and TURNED.moves_taxels and not TURNED.turns_axes
     assert TURNED.order[0] == 3 and placed_map(USPA44_MAP, {"4": TURNED}).taxels[0x004] == ("4", 0)
-
-
-def test_deformation_is_corrected_once():
-    scan = make_scan(press_counts=900, absent=(2,))
-    plain, corrected = (deformation(scan.counts, BASELINE, mounting) for mounting in (None, Mounting(signs=(1, 1, -1))))
-    assert corrected[2, 1, 1] == -900 == -plain[2, 1, 1] and np.isnan(corrected[:, 0, 2]).all()
-    assert np.array_equal(corrected[:2], plain[:2], equal_nan=True)
 
 
 def test_a_mounting_that_cannot_be_is_refused(tmp_path):
@@ -145,17 +126,3 @@ def test_a_mounting_that_cannot_be_is_refused(tmp_path):
     (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(24)), ",".join(["1000"] * 3 * 24), ""]))
     with pytest.raises(SourceError, match=r"4\.csv has 24 taxels, .* sensor 4 has 16: leave out"):
         open_sources([f"replay:{tmp_path}/4.csv"], 100.0, mountings={"4": Mounting()})
-
-
-def test_csv_of_the_vendors_server_alone_is_put_in_place(tmp_path):
-    """A CSV is as the server wrote it; edge-sr writes what it has already put in place."""
-    counts = make_scan(0, noise=3).counts
-    write_csv(tmp_path / "4.csv", counts[None])
-    write_npz(tmp_path / "4.npz", [0])
-    for name, expected in (("4.csv", TURNED.place_counts(counts)), ("4.npz", counts)):
-        texts = [f"replay:{tmp_path}/{name}"]
-        (opened,) = open_sources(texts, 1000.0, model=ID_MAPS["A"], mountings={"4": TURNED})
-        with opened as link:
-            assert link.kind == "replay"
-            (scan,) = [scan for _ in range(2) if not link.ended for scan in link.read(1.0)]
-        assert np.array_equal(scan.counts, expected) and link.counters()["scans"] == 1

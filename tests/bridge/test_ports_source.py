@@ -2,11 +2,9 @@
 
 import pytest
 from bridge_samples import make_counts, write_recording
-from link_rigs import SlcanRig
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import NoDeviceError, SourceError
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
@@ -14,7 +12,6 @@ from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.registry import FORMS, open_sources
 from firmware_bridge.links.serial_ports import PluggedAdapter, Port, find_adapter, serial_ports
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.scans.can_id_maps import ID_MAPS
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")
 SECOND_VSCOM = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30XXXXX", "USB-CAN Plus")
@@ -144,18 +141,6 @@ def test_replay_sources(tmp_path):
         (opened,) = open_sources([f"replay:{text}"], 1000.0)
         with opened as link:
             assert {scan.sensor for _ in range(2) for scan in link.read(1.0)} == sensors
-
-
-def test_the_id_map_is_the_one_asked_for(tmp_path):
-    rig = SlcanRig(tmp_path, None)
-    frames = [CanFrame(can_id, bytes(8)) for can_id, _ in ID_MAPS["XR1944"].wire_order("4")]
-    (opened,) = open_sources([rig.name], model=ID_MAPS["XR1944"])
-    with opened as link:
-        assert [(scan.sensor, scan.complete) for scan in rig.read(link, frames)] == [("4", True)]
-    rig.close()
-
-
-# A port under another name, identified by its serial number or path.
 
 
 GRIPPER = Port("/dev/ttyUSB0", (0x0403, 0x6015), "GRIP1", "gripper")

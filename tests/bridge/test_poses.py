@@ -1,5 +1,7 @@
 """Poses of a pad, and their course over time; in recordings they are played at the scans that they served."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
@@ -21,16 +23,11 @@ from firmware_bridge.recording.scan_messages import POSE, decode_pose, encode_po
 MS = 1_000_000
 
 
-def turned(turn_deg):
-    turn = np.radians(turn_deg)
-    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-
-
 def test_a_pose_seen_from_another_gives_the_place_again():
     newest, earlier = PadPose(12.0, -3.0, 100.0), PadPose(13.5, -1.0, -170.0)
     seen = earlier.seen_from(newest)
-    back = turned(newest.turn_deg) @ (seen.x_mm, seen.y_mm) + (newest.x_mm, newest.y_mm)
-    assert back == pytest.approx([13.5, -1.0]) and seen.turn_deg == pytest.approx(90.0)
+    place = complex(12.0, -3.0) + complex(seen.x_mm, seen.y_mm) * np.exp(1j * np.radians(100.0))
+    assert (place.real, place.imag) == pytest.approx((13.5, -1.0)) and seen.turn_deg == pytest.approx(90.0)
     assert seen.error_mm == pytest.approx(np.hypot(0.2, 0.2)) and seen.error_deg == pytest.approx(np.hypot(1, 1))
 
 
@@ -77,9 +74,6 @@ def test_a_pose_that_is_not_later_is_not_taken():
     assert len(track) == MOST_POSES
 
 
-# Poses in recordings: written by the sinks, read back, and played to the runtime at the scans that they served.
-
-
 STEP_NS = 10_000_000
 POSES = [
     # Time, place and sensor; and the scan that was first made with it at hand, which may be earlier than its own time.
@@ -90,33 +84,19 @@ POSES = [
 ]
 
 
-class PosedRuntime(Runtime):
-    """Runtime that also lists its poses and scans in the order in which they come."""
-
-    def __init__(self):
-        super().__init__(FakeModel(), source="replay", baselines={"4": BASELINE})
-        self.seen = []
-
-    def pose(self, pose, time_ns, sensor=None, *, holds=False):
-        self.seen.append(TimedPose(pose, time_ns, sensor, holds))
-        return super().pose(pose, time_ns, sensor, holds=holds)
-
-    def take(self, scan, clock_ns=None):
-        self.seen.append(scan.time_ns)
-        return super().take(scan, clock_ns)
-
-
 def make_scans():
     return [make_scan(number, time_ns=10**9 + number * STEP_NS, press_counts=3000, noise=3) for number in range(6)]
 
 
-def record(path, poses=POSES):
-    """Record scans and poses as a run would."""
+def poses_of(number, scan):
+    return [replace(pose, used_from_ns=scan.time_ns) for pose, first in POSES if first == number]
+
+
+def record(path):
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
     sink = McapSink(path, FakeModel().contract, fake_source(unix_offset_ns=OFFSET_NS))
     for number, scan in enumerate(make_scans()):
-        mine = [TimedPose(p.pose, p.time_ns, p.sensor, p.holds, scan.time_ns) for p, first in poses if first == number]
-        if mine:
+        if mine := poses_of(number, scan):
             sink.pose(mine)
         sink.write(runtime.push(scan), {})
     sink.close()
@@ -124,19 +104,20 @@ def record(path, poses=POSES):
 
 
 def test_poses_are_played_at_the_scans_that_they_served_again(tmp_path):
-    """Also by a recording of a replay."""
-    expected = []
-    for number, scan in enumerate(make_scans()):
-        expected += [*(pose for pose, first in POSES if first == number), scan.time_ns]
+    expected = [one for number, scan in enumerate(make_scans()) for one in (*poses_of(number, scan), scan.time_ns)]
     path = record(tmp_path / "0.mcap")
     for again in ("1.mcap", "2.mcap"):
-        runtime, statistics = PosedRuntime(), api.Statistics()
+        seen, statistics = [], api.Statistics()
+        with api.open_recording(path) as source:
+            while (taken := source.take(1.0)) is not None:
+                seen += taken
+        assert [one if isinstance(one, TimedPose) else one.time_ns for one in seen] == expected
         with api.open_recording(path) as source:
             path = tmp_path / again
             sink = McapSink(path, FakeModel().contract, fake_source(unix_offset_ns=OFFSET_NS))
-            api.pump(source, runtime, [sink], statistics)
+            api.pump(source, Runtime(FakeModel(), source="replay", baselines={"4": BASELINE}), [sink], statistics)
             sink.close()
-        assert runtime.seen == expected and (statistics.poses, statistics.poses_refused) == (len(POSES), 0)
+        assert (statistics.poses, statistics.poses_refused) == (len(POSES), 0)
 
 
 def test_poses_of_another_program_are_interpolated_in_time(tmp_path):
@@ -169,17 +150,14 @@ def test_poses_of_another_clock_hold_for_no_scan(tmp_path, ago_s, kept):
 
 def test_a_paced_replay_moves_the_poses_with_the_scans(tmp_path):
     clock = iter([70 * 10**9, *[77 * 10**9] * 9]).__next__
-    with ReplayLink([record(tmp_path / "posed.mcap")], clock=clock, sleep=lambda time_s: None) as link:
+    path = record(tmp_path / "posed.mcap")
+    with ReplayLink([path], clock=clock, sleep=lambda time_s: None) as link:
         scans = link.read(1.0)
         poses = link.poses()
     assert [scan.time_ns - 70 * 10**9 for scan in scans] == [number * STEP_NS for number in range(6)]
     assert [one.time_ns - 69 * 10**9 for one in poses] == [pose.time_ns for pose, _ in POSES]
     assert link.poses() == []
-
-
-def test_a_rate_of_its_own_leaves_the_poses_out_and_reports_it(tmp_path):
-    link = ReplayLink([record(tmp_path / "posed.mcap")], 50.0)
-    assert "its 4 poses are left out" in link.notices()[0].text
+    assert "its 4 poses are left out" in ReplayLink([path], 50.0).notices()[0].text, "a rate of its own"
 
 
 class TestCsv:

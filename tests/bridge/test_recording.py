@@ -36,7 +36,6 @@ TIMES_NS = np.array([10, 15, 20_000_010, 30_000_015])
 
 
 def write_two(folder: Path, **changes: object) -> Path:
-    """Write two scans of each of two sensors."""
     arrays = {"scan": [0, 0, 1, 1], "time_ns": TIMES_NS, "sensor": ["4", "6", "4", "6"], "counts": COUNTS} | changes
     return write_npz(folder / "finger.npz", COUNTS, **arrays)
 
@@ -164,7 +163,6 @@ def test_csv_as_programs_write_it(tmp_path, text):
 
 
 def with_columns(names: str, cells: list[str]) -> str:
-    """Return a CSV with columns before those of the taxels."""
     rows = zip([names, *cells], [HEADER, *(row(number) for number in range(len(cells)))], strict=True)
     return "".join(f"{before},{line}" for before, line in rows)
 
@@ -297,9 +295,6 @@ def test_files_that_cannot_be_read(tmp_path):
         path = tmp_path / name if content is None else write_csv(tmp_path, content, name)
         with pytest.raises(RecordingError, match=words):
             load_recording(path)
-
-
-# Where a pad is free: its baseline, if the recording has none.
 
 
 def scans(*levels, noise_counts=3):

@@ -136,9 +136,6 @@ def test_whatever_stands_in_a_key_is_borne(key, scrap, noise, place):
             assert reading.ups_hz is None or len(reading.ups_hz) == 16
 
 
-# Scans of the messages.
-
-
 class Server:
     """Server with messages and times of the test; arrivals are 2 ms after the sending."""
 
@@ -147,15 +144,13 @@ class Server:
         self.sequence = 0
         self.clock_s = UNIX_S
 
-    def say(
-        self, at_ms: float, counts=REST_COUNTS, *, age_ms: float = 0.0, way_ms=2, number: int | None = None, **changes
-    ):
+    def say(self, at_ms: float, counts=REST_COUNTS, *, age_ms: float = 0.0, number: int | None = None, **changes):
         """Return the scans that one message about one sensor closes, sent at a time in [ms]."""
         sent_s = self.clock_s + at_ms / 1e3
         entry = sensor_entry(counts, **({"time_s": sent_s - age_ms / 1e3} | changes))
         text = message(self.sequence if number is None else number, entry, time_s=sent_s)
         self.sequence += 1
-        return self.scans.feed(text, round((at_ms + way_ms) * MS))
+        return self.scans.feed(text, round((at_ms + 2) * MS))
 
     def counted(self, *names: str) -> tuple[int, ...]:
         counters = self.scans.counters()

@@ -34,7 +34,6 @@ def make_counts(scans: int, seed: int = 0) -> np.ndarray:
 
 
 def frames_of(scans: int, controller: int = 4, seed: int = 0) -> list[CanFrame]:
-    """Return the frames of so many scans that all differ."""
     return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller)]
 
 
@@ -49,7 +48,6 @@ def cycle_lines(number: int, stamp_ms: int | None = None) -> list[bytes]:
 
 
 def decoded(decoder: SlcanDecoder, data: bytes) -> list[CanFrame]:
-    """Return the frames that a decoder finds, one by one."""
     frames: list[CanFrame] = []
     for piece in decoder.cut(data):
         if isinstance(piece, CanFrame):
@@ -92,7 +90,6 @@ def write_npz(path: Path, counts: np.ndarray, /, time_ns: Any = None, sensors: A
 
 
 def wait_for(condition, within_s=60.0):
-    """Return the condition's value as soon as it is true."""
     end_s = time.monotonic() + within_s
     while not (value := condition()):
         assert time.monotonic() < end_s, "it did not come"
@@ -101,7 +98,6 @@ def wait_for(condition, within_s=60.0):
 
 
 def read_until_lost(link: Link) -> list[Scan]:
-    """Return all scans until the link is lost or ends."""
     scans: list[Scan] = []
     with suppress(LinkLostError):
         wait_for(lambda: link.ended or scans.extend(link.read(0.05)))

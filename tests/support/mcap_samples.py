@@ -15,7 +15,7 @@ from edge.cli import main as cli
 from edge.perception.runtime import Runtime
 from edge.sinks.mcap import McapSink
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading
+from firmware_bridge.scans.scan import Scan, VendorReading
 
 OFFSET_NS = 1_700_000_000_000_000_000
 SURE = make_contract(interval_factor=1.6)
@@ -67,16 +67,10 @@ def messages_of(path: Path) -> dict[str, list]:
     return by_topic
 
 
-def same_scan(got: Scan, scan: Scan) -> bool:
-    """Return True where both scans are equal bit for bit."""
-    arrays = [(getattr(got, name), getattr(scan, name)) for name in ("counts", "fresh", "renewed")]
-    for one in ("newtons", "temperature_k", "ups_hz"):
-        arrays.append((getattr(got.vendor, one, None), getattr(scan.vendor, one, None)))
-    return (
-        (got.sensor, got.number, got.time_ns, got.device_ns) == (scan.sensor, scan.number, scan.time_ns, scan.device_ns)
-        and all((a is None) == (b is None) and (a is None or a.tobytes() == b.tobytes()) for a, b in arrays)
-        and (got.counts[:, ~got.fresh] == ABSENT).all()
-    )
+def content(scan: Scan) -> list:
+    vendor = [getattr(scan.vendor, name, None) for name in ("newtons", "temperature_k", "ups_hz")]
+    arrays = [scan.counts, scan.fresh, scan.renewed, *vendor]
+    return [scan.sensor, scan.number, scan.time_ns, scan.device_ns, *(a if a is None else a.tobytes() for a in arrays)]
 
 
 def messages_alone(

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from edge_samples import FakeModel, make_contract, save_graph, tiny_deviation, tiny_traction
+from edge_samples import FakeModel, make_contract, save_graph, tiny_deviation
 from onnx import helper
 
 from edge.inference.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, POSES_NAME, Contract
@@ -13,7 +13,6 @@ WEIGHTS = np.array([0.5, 0.25, 0.0625, 2.0, 0.125], dtype=np.float32)
 
 
 def make_posed_contract(**changes) -> Contract:
-    """Return the contract of the model."""
     return make_contract(**({"taps": 7, "takes_poses": True, "reach_mm": 10.0} | changes))
 
 
@@ -24,7 +23,6 @@ def posed_pattern(window: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 
 def write_posed_model(path: Path, contract: Contract | None = None) -> Path:
-    """Write the graph."""
     contract = contract or make_posed_contract()
     scale = contract.scale
     nodes = [
@@ -65,11 +63,8 @@ class PosedModel(FakeModel):
 
     def run(self, window: np.ndarray, pad: np.ndarray | None = None, poses: np.ndarray | None = None) -> np.ndarray:
         assert poses is not None and len(poses) == len(window)
-        self.windows.append(window.copy())
-        self.pads.append(pad)
+        super().run(window, pad)
         pattern = posed_pattern(window, poses).astype(np.float32)
         if self.contract.interval_factor is not None:
             self.deviation = tiny_deviation(pattern)
-        if self.contract.traction_scale is not None:
-            self.traction = tiny_traction(window, self.contract.traction_scale).astype(np.float32)
         return pattern
