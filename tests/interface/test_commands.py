@@ -28,8 +28,9 @@ from bridge_samples import write_recording as write_counts
 from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, wait_for, write_model
 
+from edge.api import PadPose, TimedPose
 from edge.cli import main as cli
-from edge.pipeline.commands import RESET, Command, Commands, command_lines, read_stdin, user_commands
+from edge.pipeline.commands import RESET, Command, Commands, command_lines, user_commands
 from edge.terminal.progress_bar import progress
 from firmware_bridge.zeroing.baseline import save_baselines
 
@@ -98,29 +99,20 @@ def test_other_lines_are_counted(pipe, line):
 
 def test_poses_and_commands_part_and_bad_lines_stop_nothing(pipe):
     """Nobody polls, since the loop may wait for a scan: a pose without a time has that of its arrival."""
-    commands, place, before_ns = lines_of(pipe[0]), '{"cmd": "pose", "x_mm": 1, "y_mm": 2', time.monotonic_ns()
-    lines = f'{place}, "time_ns": 123}}\n{{"cmd": "pose"}}\nnonsense\n{{"cmd": "reset"}}\n{place}}}\n'
-    os.write(pipe[1], lines.encode())
+    commands, before_ns = lines_of(pipe[0]), time.monotonic_ns()
+    whole = {"cmd": "pose", "x_mm": 1.5, "y_mm": 0, "turn_deg": 5, "error_mm": 0.2, "error_deg": 1}
+    ahead_ns = before_ns + 500_000_000
+    whole |= {"sensor": "4", "time_ns": ahead_ns, "holds": True}
+    lines = [json.dumps(whole), '{"cmd": "pose"}', "nonsense", '{"cmd": "reset"}']
+    lines.append('{"cmd": "pose", "x_mm": 1, "y_mm": -2.0}\n')
+    os.write(pipe[1], "\n".join(lines).encode())
     poses = []
     wait_for(lambda: poses.extend(commands.poses.take()) or len(poses) == 2)
-    assert poses[0].time_ns == 123 and before_ns <= poses[1].time_ns <= time.monotonic_ns()
+    assert poses[0] == TimedPose(PadPose(1.5, 0.0, 5.0, 0.2, 1.0), ahead_ns, "4", True)
+    assert poses[1] == TimedPose(PadPose(1, -2), poses[1].time_ns)
+    assert before_ns <= poses[1].time_ns <= time.monotonic_ns()
     assert commands.poll() == [RESET] and (commands.refused, commands.poses.refused) == (1, 1)
     assert commands.poses.take_reasons() == {"x_mm": "a pose is refused: x_mm is missing, expected a number"}
-
-
-def test_a_terminal_and_a_missing_stdin_are_left_alone(stdin):
-    leader, follower = os.openpty()
-    os.write(leader, b'{"cmd": "reset"}\n')
-    with os.fdopen(follower) as terminal:
-        for given in (terminal, None):
-            stdin(given)
-            commands = Commands()
-            with read_stdin(commands):
-                assert commands.poll() == []
-    stdin(terminal)  # closed
-    with read_stdin(commands):
-        assert commands.poll() == []
-    os.close(leader)
 
 
 def test_all_places_are_asked_and_obeyed_in_their_order(stdin, pipe):
@@ -140,6 +132,8 @@ def test_all_places_are_asked_and_obeyed_in_their_order(stdin, pipe):
                 for command in everything.poll():
                     command.carry_out(runtime)
             assert everything.refused == 1
+    with user_commands() as nothing:  # by a stdin that is closed
+        assert nothing.poll() == []
     done.remove((None, False))  # the signal's, which may come between those of stdin
     assert done == ["reset", ("4", True)]
 
@@ -286,15 +280,9 @@ def test_a_replay_shows_the_live_line(tmp_path, monkeypatch, capfd, window, opti
     assert ("REPLAY | " in window.said()) == lives
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """Clock of the bars, which goes on as a test sets `now_s`."""
-    clock = SimpleNamespace(now_s=100.0)
+def test_a_bar_comes_after_two_seconds_on_a_terminal_alone(window, monkeypatch):
+    clock, pipe = SimpleNamespace(now_s=100.0), io.StringIO()
     monkeypatch.setattr("tqdm.std.time", lambda: clock.now_s)
-    return clock
-
-
-def test_a_bar_comes_after_two_seconds_and_leaves_no_trace(window, clock):
     with progress("poses", 400, "pose", done=100, stream=window.stream) as bar:
         clock.now_s += 1.9
         bar.update(38)
@@ -306,10 +294,6 @@ def test_a_bar_comes_after_two_seconds_and_leaves_no_trace(window, clock):
         os.close(window.ours)  # a window that is closed ends no work
         window.ours = None
         bar.update()
-
-
-def test_no_bar_without_a_terminal(clock):
-    pipe = io.StringIO()
     with progress("poses", 400, "pose", stream=pipe) as bar:
         clock.now_s += 9
         bar.update()

@@ -40,9 +40,14 @@ def made(tmp_path) -> tuple[Path, list[Result]]:
     return path, results
 
 
-def test_arrays_hold_scans_results_maps_baselines_and_poses(made):
+def test_arrays_hold_all_but_what_is_named_as_left_out(made, capsys):
     path, results = made
     arrays = arrays_of(path)
+    left_out = set(re.findall(r"\w+", capsys.readouterr().out.partition("not in it: ")[2]))
+    table = (ROOT / "docs" / "recordings.md").read_text().partition("| [`.npz`]")[2].partition("\n")[0]
+    assert not left_out & arrays.keys()
+    for name in record(results[-1], {}).keys() - arrays.keys() - {"poses"}:  # these of models that take them alone
+        assert name in left_out and name in table
     results = sorted(results, key=lambda one: one.scan.time_ns)
     order = np.argsort(arrays["time_ns"], kind="stable")
     rows = {name: array[order] for name, array in arrays.items() if array.shape[:1] == (len(results),)}
@@ -69,16 +74,6 @@ def test_arrays_hold_scans_results_maps_baselines_and_poses(made):
                 assert not rows[field.name][row].any()
     assert set(arrays["origin"]) == {"emulated"} and arrays["pose_sensor"].tolist() == ["4"] * 6
     assert arrays["pose"][1].tolist() == [4.0, -4 / 3, 40.0, 0.4, 0.5]
-
-
-def test_each_key_of_a_record_is_an_array_or_named_as_left_out(made, capsys):
-    path, results = made
-    arrays = arrays_of(path)
-    left_out = set(re.findall(r"\w+", capsys.readouterr().out.partition("not in it: ")[2]))
-    table = (ROOT / "docs" / "recordings.md").read_text().partition("| [`.npz`]")[2].partition("\n")[0]
-    assert not left_out & arrays.keys()
-    for name in record(results[-1], {}).keys() - arrays.keys() - {"poses"}:  # these of models that take them alone
-        assert name in left_out and name in table
 
 
 def test_a_csv_has_the_id_maps_order_and_says_what_is_missing(made, tmp_path, capsys):
