@@ -13,7 +13,7 @@ from edge_samples import BASELINE, REST, FakeModel, make_contract, make_pad_cont
 from mcap_samples import arrays_of
 
 from edge import api
-from edge.api import USPA44, USPA46, ModelError, Pad, RecordingError, Runtime, Scan, Source, Stream, UsageError
+from edge.api import USPA46, ModelError, Pad, RecordingError, Runtime, Scan, Source, Stream, UsageError
 from edge.doctor.command import keep
 from edge.doctor.guided_press import Press, corner_taxel, find_axes, find_order, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -82,17 +82,6 @@ def test_the_doctor_keeps_the_pad_in_the_places_that_it_found(tmp_path):
     keep(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(pad=PAD)}), None, {}, {"4": TURNED}, {})
     kept = load_sensor_file(tmp_path / "s.toml").sensors["4"]
     assert kept.mounting == TURNED and kept.pad == PAD.turned(TURNED) != PAD
-
-
-def test_a_baseline_of_another_order_is_refused(file, pressed, tmp_path):
-    """Each taxel would get another one's rest."""
-    save_baselines(tmp_path / "wired.json", [BASELINE])
-    with pytest.raises(RecordingError, match=r"wired\.json: the taxels of sensor 4 lay in another order: zero again"):
-        first(pressed, file, baselines=tmp_path / "wired.json")
-    save_baselines(tmp_path / "placed.json", [BASELINE], {"4": TURNED.order})
-    assert first(pressed, file, baselines=tmp_path / "placed.json").baseline
-    with pytest.raises(RecordingError, match="another order"):
-        first(pressed, baselines=tmp_path / "placed.json")
 
 
 def test_options_go_before_the_file_but_for_another_id_map(file, pressed, tmp_path):
@@ -221,17 +210,6 @@ def test_a_sensor_file_has_the_grid_of_its_model(tmp_path):
     (tmp_path / "s.toml").write_text(text.replace('"uSPa46"', '"uSPa44"'))
     with pytest.raises(SensorFileError, match="expected 4 rows of 4"):
         load_sensor_file(tmp_path / "s.toml")
-
-
-def test_what_is_of_another_grid_is_refused_by_the_runtime(model):
-    loaded = api.load_model(model)
-    settings = {"source": "device", "geometry": USPA46}
-    with pytest.raises(UsageError, match="mounting of sensor 4 is of 16 taxels, expected 24"):
-        Runtime(loaded, mountings={"4": Mounting()}, **settings)
-    with pytest.raises(UsageError, match="48 gains, expected 72"):
-        Runtime(loaded, pad=Pad(gains=(1.0,) * 48), **settings)
-    with pytest.raises(ModelError, match="give a --model trained for it"):
-        Runtime(loaded, source="device", geometry=USPA44)
 
 
 def test_a_recording_may_name_another_pad_than_its_scans_have(tmp_path):

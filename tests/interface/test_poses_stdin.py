@@ -6,7 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from cli_samples import base_options, files, run, start, write_recording
+from cli_samples import base_options, files, start, write_recording
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan, wait_for
 from pose_samples import make_posed_contract
 
@@ -18,22 +18,7 @@ from edge.pipeline.run_statistics import Statistics
 from firmware_bridge.schedule import SENSOR_SILENT_NS
 
 __all__ = ["files"]
-WHOLE = (
-    '{"cmd": "pose", "x_mm": 1.5, "y_mm": 0, "turn_deg": 5, "error_mm": 0.2, "error_deg": 1, "sensor": "4", '
-    '"time_ns": 123, "holds": true}'
-)
 NOW_NS = 10**12
-
-
-def test_all_fields_are_taken_and_place_alone_is_enough():
-    expected = TimedPose(PadPose(1.5, 0.0, 5.0, 0.2, 1.0), 123, "4", True)
-    assert pose_queue.pose_of_fields(json.loads(WHOLE), NOW_NS) == expected
-    assert pose_queue.pose_of_fields({"cmd": "pose", "x_mm": 1, "y_mm": -2.0}, NOW_NS) == TimedPose(
-        PadPose(1, -2), NOW_NS
-    )
-    assert pose_queue.pose_of_fields(
-        {"x_mm": 0, "y_mm": 0, "time_ns": NOW_NS + pose_queue.FURTHEST_AHEAD_NS}, NOW_NS
-    )  # a little ahead
 
 
 @pytest.mark.parametrize(
@@ -120,19 +105,6 @@ def test_a_silent_source_is_reported_once_and_when_it_is_back(step):
     assert {sensor for _, sensor, _ in step(10**15)[1]} == {None, "4"}, "one that holds is not missed"
 
 
-class PoseSink(ListSink):
-    def __init__(self):
-        super().__init__()
-        self.seen = []
-
-    def pose(self, poses):
-        self.seen += [("pose", one.pose.x_mm) for one in poses]
-
-    def write(self, result, counters):
-        super().write(result, counters)
-        self.seen.append(("scan", result.scan.number))
-
-
 @pytest.mark.parametrize(
     ("of_link", "why"),
     [
@@ -142,14 +114,16 @@ class PoseSink(ListSink):
     ],
 )
 def test_poses_reach_the_sinks_before_the_scans_that_they_serve(of_link, why):
-    commands, sink, statistics = Commands(), PoseSink(), Statistics()
+    commands, seen, statistics = Commands(), [], Statistics()
+    sink = ListSink(lambda result: seen.append(("scan", result.scan.number)))
+    sink.pose = lambda poses: seen.extend(("pose", one.pose.x_mm) for one in poses)
     commands.poses.put(pose(1, 7.0))
     link = FakeLink([[make_scan(0)], [make_scan(1)]])
     vars(link).update(of_link)
     with Source(link) as source:
         pump(source, make_runtime(), [sink], statistics, commands=commands)
     used = int(why is None)
-    assert sink.seen == [("pose", 7.0), ("scan", 0), ("scan", 1)][1 - used :]
+    assert seen == [("pose", 7.0), ("scan", 0), ("scan", 1)][1 - used :]
     assert [why in event.text for event in sink.events] == [True] * (1 - used)
     assert (statistics.poses, statistics.poses_refused, statistics.poses_dropped) == (used, 1 - used, 0)
     assert sink.counters[-1]["poses"] == used
@@ -186,10 +160,3 @@ def test_ctrl_c_writes_the_map_of_poses_on_stdin(files, tmp_path):
     assert place == [5, -3] and fused > 3
     assert f"map: {fused} patterns fused" in err and f"; {out} written" in err
     assert "takes none" not in err, "a map uses the poses, whatever the model takes"
-
-
-def test_a_run_without_poses_says_so_and_writes_nothing(files, tmp_path):
-    done = run("map", *base_options(files), "--source", f"replay:{files / 'taps.npz'}", "--out", tmp_path / "m.npz")
-    assert done.returncode == 0 and list(tmp_path.iterdir()) == []
-    assert "patterns came without a pose, so the map is empty: send poses of the pad" in done.stderr
-    assert "without a pose; no file written" in done.stderr
