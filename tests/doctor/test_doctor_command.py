@@ -174,7 +174,6 @@ def test_two_sensors_are_pressed_in_turn_and_compared_in_a_grip():
 
 
 def examined(open_link, *arguments, out=None, err=None):
-    """Return the exit code and the output of a visit to a link."""
     options, out = parser("doctor").parse_args([*map(str, arguments)]), out or io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(examine, "links_to", lambda _, sensor_file, __: ([open_link()], sensor_file))

@@ -16,13 +16,13 @@ from edge.cli.main import main
 from edge.doctor.command import keep
 from edge.doctor.findings import Finding, summary
 from edge.pipeline.gain_keeper import keep_learned
-from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import PadFrame, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 GAINS = tuple(np.linspace(0.9, 1.1, 48).tolist())
+TURNED = Mounting(tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()), True, (1, -1, -1))
 WHOLE = SensorEntry(Mounting(swap_xy=True), 1180.0, BASELINE)
 NONE: dict = {}
 
@@ -77,7 +77,10 @@ class TestLoss:
 class TestMarks:
     def test_a_later_visit_takes_back_what_it_finds(self, tmp_path):
         path = tmp_path / "s.toml"
-        first = keep(path, SensorFile(), None, {"4": BASELINE}, {"4": Mounting()}, NONE, emulated=True)
+        known = SensorFile(sensors={"4": SensorEntry(pad=Pad(gains=GAINS), assumed=frozenset({"mounting"}))})
+        first = keep(path, known, None, {"4": BASELINE}, {"4": TURNED}, NONE, emulated=True)
+        assert first.sensors["4"].mounting == TURNED, "the pad's gains are in the places that were found"
+        assert first.pads["4"] == Pad(gains=GAINS).turned(TURNED) != Pad(gains=GAINS)
         assert first.sensors["4"].emulated == {"mounting", "baseline"} and not first.sensors["4"].assumed
         assert "]  # measured on an emulated sensor: not for a device\n" in path.read_text()
         second = keep(path, load_sensor_file(path), None, {"4": BASELINE}, NONE, NONE)
@@ -93,9 +96,6 @@ def test_a_device_refuses_an_emulated_sensor():
     words = r"has baseline of an emulated sensor 4, and this is a device: .*edge-sr doctor --out"
     with pytest.raises(SensorFileError, match=words), Source(FakeLink([], kind="device"), sensor_file=EMULATED):
         pass
-    with Source(FakeLink([], kind="emulated"), sensor_file=EMULATED):
-        pass
-    refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", None)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,6 @@ WELL = as_scans(healthy_counts(200))
 
 
 def told(*arguments, link=lambda: FakeLink([WELL], kind="replay"), out=None):
-    """The exit code, and what the doctor printed of a link that is well."""
     return examined(link, "--no-press", *arguments, out=out)
 
 

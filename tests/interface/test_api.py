@@ -46,7 +46,6 @@ def timeless(record):
 
 
 def played(files, **settings):
-    """Records of the API, written by its own sink."""
     out, model = files / "api.jsonl", load_model(files / "sure.onnx")
     with open_recording(files / "taps.npz") as source:
         runtime = open_runtime(model, source, baselines=files / "zero.json", **settings)
@@ -121,17 +120,11 @@ def test_what_cannot_be_is_one_line(ask, words):
     assert "\n" not in str(raised.value)
 
 
-class Outage(FakeLink):
-    """A cable that is out for a moment after ten scans."""
-
-    def notices(self):
-        return [Notice(0, kind, kind) for kind in ("lost", "back")] if self.reads == 11 else []
-
-
 def test_a_loop_that_was_left_goes_on_with_the_next_result():
     """Scans that waited in its batch have their results, and a cable that was out in between is not forgotten."""
     torn = make_scan(10, press_counts=3000, absent=(1,))
-    link = Outage([[make_scan(n, press_counts=3000) for n in range(9)], *[[]] * 9, [torn, make_scan(11)]])
+    link = FakeLink([[make_scan(n, press_counts=3000) for n in range(9)], *[[]] * 9, [torn, make_scan(11)]])
+    link.notices = lambda: [Notice(0, kind, kind) for kind in ("lost", "back")] if link.reads == 11 else []
     heard = []
     with Source(link) as source:
         while not link.ended:
@@ -227,5 +220,7 @@ def test_of_a_recording_poses_are_stated_at_its_own_times(tmp_path):
         stream = Stream(source, runtime)
         with pytest.raises(UsageError, match=r"is a recording: give `runtime.pose` a PadPose and a time of its scans"):
             stream.pose(0, 0)
+        with pytest.raises(UsageError, match=r"without a latest.*paced=True"):
+            stream.latest()
         runtime.pose(api.PadPose(3, 4), 0, holds=True)
         assert {result.pose for result in stream} == {PadPose(3, 4)}

@@ -20,6 +20,7 @@ import termios
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ from edge_samples import BASELINE, ROOT, wait_for, write_model
 
 from edge.api import PadPose, TimedPose
 from edge.cli import main as cli
-from edge.pipeline.commands import RESET, Command, Commands, command_lines, user_commands
+from edge.pipeline.commands import RESET, ZERO, Command, Commands, command_lines, user_commands
 from edge.terminal.progress_bar import progress
 from firmware_bridge.zeroing.baseline import save_baselines
 
@@ -60,15 +61,12 @@ def pipe():
             os.close(end)
 
 
-FORCED_ZERO = Command("zero", None, True)
-
-
 @pytest.mark.parametrize(
     ("pieces", "expected", "refused"),
     [
         ([b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"', b':"reset"}\r\n'], [RESET] * 3, 0),
         ([b"x" * 4000] * 20 + [b'{"cmd": "reset"}\n{"cmd": "reset"}\n'], [RESET], 1),  # a line without end is one
-        ([b'{"cmd": "zero", "sensor": null, "force": true}'], [FORCED_ZERO], 0),  # the end of the pipe ends a line
+        ([b'{"cmd": "zero", "sensor": null, "force": true}'], [Command("zero", None, True)], 0),  # its end ends a line
     ],
 )
 def test_commands_come_as_lines_however_they_are_cut(pipe, pieces, expected, refused):
@@ -118,24 +116,18 @@ def test_poses_and_commands_part_and_bad_lines_stop_nothing(pipe):
 def test_all_places_are_asked_and_obeyed_in_their_order(stdin, pipe):
     with os.fdopen(os.dup(pipe[0])) as commands:
         stdin(commands)
-        done = []
-
-        def zero(name=None, *, force=False):
-            done.append((name, force))
-
-        runtime = SimpleNamespace(reset=lambda: done.append("reset"), zero=zero)
         with user_commands() as everything:
             os.write(pipe[1], b'nonsense\n{"cmd": "reset"}\n{"cmd": "zero", "sensor": "4", "force": true}\n')
             os.kill(os.getpid(), signal.SIGUSR1)
-            deadline_s = time.monotonic() + 20
-            while len(done) < 3 and time.monotonic() < deadline_s:  # a thread reads stdin
-                for command in everything.poll():
-                    command.carry_out(runtime)
-            assert everything.refused == 1
+            got = taken(everything, 4)
+        assert everything.refused == 1
     with user_commands() as nothing:  # by a stdin that is closed
         assert nothing.poll() == []
-    done.remove((None, False))  # the signal's, which may come between those of stdin
-    assert done == ["reset", ("4", True)]
+    got.remove(ZERO)  # the signal's, which may come between those of stdin
+    runtime = Mock()
+    for command in got:
+        command.carry_out(runtime)
+    assert runtime.mock_calls == [call.reset(), call.zero("4", force=True)]
 
 
 TIMEOUT_S = 60.0

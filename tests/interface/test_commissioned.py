@@ -14,7 +14,6 @@ from mcap_samples import arrays_of
 
 from edge import api
 from edge.api import USPA46, ModelError, Pad, RecordingError, Runtime, Scan, Source, Stream, UsageError
-from edge.doctor.command import keep
 from edge.doctor.guided_press import Press, corner_taxel, find_axes, find_order, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import SensorFileError
@@ -47,7 +46,6 @@ def pressed(tmp_path):
 
 
 def first(pressed, sensor=None, id_map=None, **settings):
-    """The first result of the press."""
     with api.open_source(pressed, sensor=sensor, id_map=id_map) as source:
         return next(iter(Stream(source, api.open_runtime(FakeModel(), source, **settings))))
 
@@ -76,12 +74,6 @@ def test_a_pad_goes_from_the_file_into_every_runtime(pressed, tmp_path):
                 # A replay keeps the recording's time: a scan that waited while the runtime was made may be dropped.
                 assert next(result for result in results if result.state != "dropped").state == "contact"
             np.testing.assert_array_equal(model.pads[0], model.contract.pad_row(expected))
-
-
-def test_the_doctor_keeps_the_pad_in_the_places_that_it_found(tmp_path):
-    keep(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(pad=PAD)}), None, {}, {"4": TURNED}, {})
-    kept = load_sensor_file(tmp_path / "s.toml").sensors["4"]
-    assert kept.mounting == TURNED and kept.pad == PAD.turned(TURNED) != PAD
 
 
 def test_options_go_before_the_file_but_for_another_id_map(file, pressed, tmp_path):
@@ -121,22 +113,19 @@ PRESSED = 17
 REST_SCANS, SCANS = 20, 60
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    return write_model(tmp_path_factory.mktemp("model") / "pad46.onnx", CONTRACT_46)
-
-
-def test_bytes_become_patterns_and_files_of_the_pads_own_shape(model, tmp_path):
+def test_bytes_become_patterns_and_files_of_the_pads_own_shape(tmp_path):
     """Scans at rest, then a press on one taxel of the third row, over a pseudo-terminal, and played again."""
     counts = REST_46 + np.random.default_rng(0).integers(-2, 3, (SCANS, *REST_46.shape)).astype(np.int32)
     for taxel, size in ((PRESSED, 4000), (PRESSED - 1, 400), (PRESSED - 6, 400)):  # a taxel alone would be a fault
         counts[REST_SCANS:, 2].reshape(-1, 24)[:, taxel] += size
+    model = write_model(tmp_path / "pad46.onnx", CONTRACT_46)
     recording, results = Recording(tmp_path / "pad.npz", (Track("4", counts, None),), 100.0), []
     with (
         Emulator([recording]) as emulator,
         api.open_source(f"slcan:{emulator.port}", id_map="uSPa46", give_up_s=0) as source,
     ):
-        runtime = api.open_runtime(api.load_model(model), source, baselines={"4": BASELINE_46})
+        pad = Pad(gains=(1.0,) * 72)
+        runtime = api.open_runtime(api.load_model(model), source, baselines={"4": BASELINE_46}, pad=pad)
         sinks = [api.open_sink(f"{form}:{tmp_path}/out.{form}", CONTRACT_46, source) for form in ("jsonl", "mcap")]
         with suppress(api.LinkLostError):
             results.extend(Stream(source, runtime, sinks=sinks))

@@ -81,18 +81,14 @@ def test_the_bundled_model_drops_foreign_taps_and_flags_a_magnet(demo):
     assert max(used[scene == 1]) == 1
 
 
-@pytest.fixture(scope="module")
-def posed(tmp_path_factory):
-    """A tiny model that takes poses, pad and gains, as the one of the demo does."""
-    path = tmp_path_factory.mktemp("posed") / "posed.onnx"
+def test_a_looping_demo_is_scored_once_and_begins_each_pass_anew(demo, tmp_path, capfd):
+    """The demo's own scans, twice, from a link that waits for its reader: no machine is too slow for it."""
+    # A tiny model that takes poses, pad and gains, as the one of the demo does.
     pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
     takes = {"trust": make_posed_trust(100.0).to_json(), "pad_inputs": pad_inputs, "takes_gains": True}
-    write_posed_model(path, make_posed_contract(interval_factor=1.6, output_full_scale=100.0, **takes))
-    return str(path)
-
-
-def test_a_looping_demo_is_scored_once_and_begins_each_pass_anew(demo, posed, tmp_path, capfd):
-    """The demo's own scans, twice, from a link that waits for its reader: no machine is too slow for it."""
+    contract = make_posed_contract(interval_factor=1.6, output_full_scale=100.0, **takes)
+    model = tmp_path / "posed.onnx"
+    write_posed_model(model, contract)
     tap_of, counts = demo["tap"], demo["counts"].astype(np.int32)
     poses = load_recording(demo_recording()).poses
     series, path = ScanSeries("4", USPA44), tmp_path / "out.jsonl"
@@ -106,7 +102,7 @@ def test_a_looping_demo_is_scored_once_and_begins_each_pass_anew(demo, posed, tm
         return [waiting.pop(0) for one in tuple(waiting) if one.time_ns < now_ns]
 
     link.poses = stated
-    options = parsed_options("", ["--source", "demo:loop", "--sink", f"jsonl:{path}", "--model", posed])
+    options = parsed_options("", ["--source", "demo:loop", "--sink", f"jsonl:{path}", "--model", str(model)])
     run_command.run(options, Source(link))
     out, err = capfd.readouterr()
     assert out.count("4 of 4 taps scored") == 1 and err.count("continues until Ctrl-C") == 1
