@@ -137,27 +137,6 @@ def test_read_passes_over_what_a_loop_had_made_and_left(way):
         read()
 
 
-def test_a_loop_and_the_newest_share_one_stream():
-    link = StagedLink(scans(0, 1, 2, 3), scans(4), scans(5, 6), endless=True)
-    with Source(link) as source:
-        stream, seen = stream_of(source), []
-        link.let(0)
-        for result in stream:
-            seen.append(result.scan.number)
-            if len(seen) == 2:
-                break
-        link.let(1)
-        latest = stream.latest()  # of those that the loop was in, and of those that came since
-        assert (latest.result.scan.number, latest.skipped) == (4, 2)
-        link.let(2)
-        for result in stream:
-            seen.append(result.scan.number)
-            if len(seen) == 4:
-                break
-        assert stream.latest().new is False
-    assert seen == [0, 1, 5, 6]
-
-
 def test_a_source_is_opened_once_and_has_one_stream_at_a_time():
     source = Source(FakeLink([scans(0)], endless=True))
     assert repr(source) == "<Source fake, not open>"
