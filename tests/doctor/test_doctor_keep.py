@@ -39,7 +39,7 @@ class TestLoss:
             keep(tmp_path / "s.toml", SensorFile(), None, NONE, NONE, NONE)
         assert list(tmp_path.iterdir()) == []
 
-    def test_what_is_not_measured_again_or_was_learned_meanwhile_is_kept(self, tmp_path):
+    def test_what_was_learned_or_is_not_measured_again_is_kept(self, tmp_path):
         path, interval = tmp_path / "s.toml", (1100.0, 1260.0)
         held = replace(WHOLE, pad=Pad(thickness_mm=4.2), frame=PadFrame("tool0"), counts_per_newton_interval=interval)
         save_sensor_file(path, SensorFile(sensors={"4": held}))
