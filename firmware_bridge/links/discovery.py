@@ -1,7 +1,7 @@
 """Discovery of devices that may lead to a sensor on this machine, and of their problems. Opens and sends nothing."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -73,17 +73,15 @@ def devices() -> tuple[list[Found], list[str]]:
     return [*serial_devices(serial_ports()), *gs_usb, *can_interfaces()], notes
 
 
-def serial_devices(
-    ports: Sequence[Port], may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK)
-) -> list[Found]:
-    """Describe the serial ports, in their order; `may_open` returns True if this user may read and write a path."""
+def serial_devices(ports: Sequence[Port]) -> list[Found]:
+    """Describe the serial ports, in their order."""
     serials = [port.serial_number for port in ports]
     listed: list[Found] = []
     for port in ports:
         words = " by ".join(word for word in (port.product or port.description, port.manufacturer) if word)
         alone = port.serial_number is not None and serials.count(port.serial_number) == 1
         problems: list[str] = []
-        if not may_open(port.path):
+        if not os.access(port.path, os.R_OK | os.W_OK):
             problems.append(NO_PERMISSION)
         if held := holders(port.path):
             problems.append(f"held by {', '.join(held)}: end it first")

@@ -100,12 +100,15 @@ def verdicts(done):
     }
 
 
-def test_a_healthy_sensor_is_0_and_ok_in_every_line():
+def test_a_healthy_sensor_is_0_and_ok_in_every_line(plugged, tmp_path):
+    file = tmp_path / "s.toml"
     with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-        done = doctor(emulator.port, "--json")
+        plugged.append(Port(str(Path(emulator.port).resolve()), (0x0403, 0x6015), "D30BL366", "adapter"))
+        done = doctor(emulator.port, "--json", "--out", file)
+    assert load_sensor_file(file).adapter == "D30BL366", "the serial number of the adapter is kept"
     document = json.loads(done.out)
     assert verdicts(done) == {}
-    told = {"stopped": False, "kind": "emulated", "sensor_file": None, "id_map": "uSPa44"}
+    told = {"stopped": False, "kind": "emulated", "sensor_file": str(file), "id_map": "uSPa44"}
     assert document | told == document
     assert len(document["findings"]) == 14
     assert "stdin is not a terminal" in document["findings"][-1]["remedy"]
@@ -130,18 +133,13 @@ def test_the_next_run_goes_by_the_order_axes_and_force_measured(monkeypatch, tmp
     in_place = REST.reshape(3, 16)[:, list(sits.order)].reshape(3, 4, 4)
     assert entry.baseline is not None and np.abs(entry.baseline.counts - in_place).max() <= 2
 
-    done = visited(Person(sits), "--json", "--sensor", file, drift_s=1.5)
-    assert verdicts(done) == {}, done.out
-    settled = {one["name"]: one["verdict"] for one in json.loads(done.out)["findings"]}
-    assert settled["taxel order"] == settled["axis signs"] == settled["load"] == "ok"
-
-
-def test_a_scale_of_mistyped_grams_is_not_kept(tmp_path):
-    file = tmp_path / "sensor.toml"
-    done = visited(Person(), "--out", file, typed=["2000"])
-    (entry,) = load_sensor_file(file).sensors.values()
-    assert "not kept" in " ".join(done.out.split()) and "train.own" not in done.out
-    assert entry.counts_per_newton is entry.counts_per_newton_interval is None
+    done = visited(Person(sits), "--json", "--sensor", file, "--out", file, typed=["2000"], drift_s=1.5)
+    assert verdicts(done) == {"force": "look"}, done.out
+    findings = {one["name"]: one for one in json.loads(done.out)["findings"]}
+    assert {findings[name]["verdict"] for name in ("taxel order", "axis signs", "load")} == {"ok"}
+    assert "not kept" in findings["force"]["remedy"], "the scale of mistyped grams"
+    again = load_sensor_file(file).sensors["4"]
+    assert (again.counts_per_newton, again.mounting) == (entry.counts_per_newton, sits)
 
 
 def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path, limits):
@@ -176,7 +174,6 @@ def test_two_sensors_are_pressed_in_turn_and_compared_in_a_grip():
 
 
 def examined(open_link, *arguments, out=None, err=None):
-    """Return the exit code and the output of a visit to a link."""
     options, out = parser("doctor").parse_args([*map(str, arguments)]), out or io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(examine, "links_to", lambda _, sensor_file, __: ([open_link()], sensor_file))
@@ -237,13 +234,6 @@ def test_a_cable_pulled_out_is_3_after_what_was_found(tmp_path):
         done = doctor(emulator.port, "--out", tmp_path / "s.toml", drift_s=30)
     assert done.code == 3 and "link: lost" in done.out and "noise" in done.out
     assert "link lost" in done.err and not (tmp_path / "s.toml").exists()
-
-
-def test_the_serial_number_of_the_adapter_is_kept(plugged, tmp_path):
-    with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-        plugged.append(Port(str(Path(emulator.port).resolve()), (0x0403, 0x6015), "D30BL366", "adapter"))
-        doctor(emulator.port, "--out", tmp_path / "s.toml")
-    assert load_sensor_file(tmp_path / "s.toml").adapter == "D30BL366"
 
 
 def test_a_recording_is_examined_but_not_pressed(tmp_path):

@@ -16,16 +16,15 @@ from edge.cli.main import main
 from edge.doctor.command import keep
 from edge.doctor.findings import Finding, summary
 from edge.pipeline.gain_keeper import keep_learned
-from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import PadFrame, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 GAINS = tuple(np.linspace(0.9, 1.1, 48).tolist())
+TURNED = Mounting(tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()), True, (1, -1, -1))
 WHOLE = SensorEntry(Mounting(swap_xy=True), 1180.0, BASELINE)
 NONE: dict = {}
-ASSUMED: dict = {"assumed": frozenset({"mounting"})}
 
 
 @pytest.fixture
@@ -40,16 +39,19 @@ class TestLoss:
             keep(tmp_path / "s.toml", SensorFile(), None, NONE, NONE, NONE)
         assert list(tmp_path.iterdir()) == []
 
-    def test_what_is_not_measured_again_is_kept(self, tmp_path):
+    def test_what_was_learned_or_is_not_measured_again_is_kept(self, tmp_path):
         path, interval = tmp_path / "s.toml", (1100.0, 1260.0)
         held = replace(WHOLE, pad=Pad(thickness_mm=4.2), frame=PadFrame("tool0"), counts_per_newton_interval=interval)
         save_sensor_file(path, SensorFile(sensors={"4": held}))
+        known, learned = load_sensor_file(path), Pad(gains=GAINS, gain_half_widths=(0.05,) * 48)
+        for name in ("4", "7"):  # by a run during the visit
+            keep_learned(path, name, learned)
         found = {"6": Baseline.of("6", BASELINE.counts, 1.79e9, 100, "start-up")}
-        keep(path, load_sensor_file(path), None, found, NONE, NONE)
+        keep(path, known, None, found, NONE, NONE)
         now = load_sensor_file(path).sensors
-        assert now.keys() == {"4", "6"} and now["4"].baseline.id == BASELINE.id
-        assert replace(now["4"], baseline=BASELINE) == held
-        assert load_sensor_file(path.with_name("s.toml.bak")).sensors.keys() == {"4"}
+        assert now.keys() == {"4", "6", "7"} and now["4"].baseline.id == BASELINE.id
+        assert replace(now["4"], baseline=BASELINE) == replace(held, learned=learned) and now["7"].learned == learned
+        assert load_sensor_file(path.with_name("s.toml.bak")).sensors.keys() == {"4", "7"}
 
     def test_a_pressed_pad_leaves_the_baseline_of_the_free_pad(self, tmp_path):
         path, free = tmp_path / "s.toml", healthy_counts(200)
@@ -65,16 +67,6 @@ class TestLoss:
             now = load_sensor_file(path).sensors["4"].baseline
             assert (now.id != baseline.id) is stored and np.abs(now.counts - baseline.counts).max() < 10
 
-    def test_gains_that_a_run_learned_during_the_visit_are_kept(self, tmp_path):
-        path, learned = tmp_path / "s.toml", Pad(gains=GAINS, gain_half_widths=(0.05,) * 48)
-        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(**ASSUMED)}))
-        known = load_sensor_file(path)
-        for name in ("4", "6"):
-            keep_learned(path, name, learned)
-        keep(path, known, None, {"4": BASELINE}, NONE, NONE)
-        now = load_sensor_file(path)
-        assert now.pads == {"4": learned, "6": learned} and now.baselines["4"].id == BASELINE.id
-
     def test_an_emulated_sensor_does_not_overwrite_a_devices_file(self, good):
         link = FakeLink([WELL], kind="emulated")
         with pytest.raises(SensorFileError, match="it is of a device, and this one is emulated"):
@@ -85,7 +77,10 @@ class TestLoss:
 class TestMarks:
     def test_a_later_visit_takes_back_what_it_finds(self, tmp_path):
         path = tmp_path / "s.toml"
-        first = keep(path, SensorFile(), None, {"4": BASELINE}, {"4": Mounting()}, NONE, emulated=True)
+        known = SensorFile(sensors={"4": SensorEntry(pad=Pad(gains=GAINS), assumed=frozenset({"mounting"}))})
+        first = keep(path, known, None, {"4": BASELINE}, {"4": TURNED}, NONE, emulated=True)
+        assert first.sensors["4"].mounting == TURNED, "the pad's gains are in the places that were found"
+        assert first.pads["4"] == Pad(gains=GAINS).turned(TURNED) != Pad(gains=GAINS)
         assert first.sensors["4"].emulated == {"mounting", "baseline"} and not first.sensors["4"].assumed
         assert "]  # measured on an emulated sensor: not for a device\n" in path.read_text()
         second = keep(path, load_sensor_file(path), None, {"4": BASELINE}, NONE, NONE)
@@ -101,9 +96,6 @@ def test_a_device_refuses_an_emulated_sensor():
     words = r"has baseline of an emulated sensor 4, and this is a device: .*edge-sr doctor --out"
     with pytest.raises(SensorFileError, match=words), Source(FakeLink([], kind="device"), sensor_file=EMULATED):
         pass
-    with Source(FakeLink([], kind="emulated"), sensor_file=EMULATED):
-        pass
-    refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", None)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +117,6 @@ WELL = as_scans(healthy_counts(200))
 
 
 def told(*arguments, link=lambda: FakeLink([WELL], kind="replay"), out=None):
-    """The exit code, and what the doctor printed of a link that is well."""
     return examined(link, "--no-press", *arguments, out=out)
 
 

@@ -101,7 +101,6 @@ class Timed:
 
 
 def results_at(**times_ms):
-    """Results, by the time of their scans, of sensors at times."""
     made = [Timed(name, time_ms) for name, times in times_ms.items() for time_ms in times]
     return sorted(made, key=lambda result: result.scan.on_bus_ns)
 

@@ -25,7 +25,6 @@ from edge.api import open_recording, take_baselines
 from edge.cli import listings
 from edge.cli import main as cli
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -41,13 +40,6 @@ def test_a_sensor_gets_one_taps_model_and_the_demo_that_of_poses(tmp_path):
         assert {record["model"] for record in records(done.stdout)} == {model}
 
 
-def test_the_short_help_has_the_usual_options_on_one_screen(capsys):
-    assert cli.main(["-h"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) < 60 and any("--source" in line for line in lines)
-    assert lines[-1].startswith("edge-sr --help lists all options")
-
-
 def test_help_fits_the_terminal_and_80_columns(capsys, monkeypatch):
     for columns, most in (("1", 40), ("40", 40), ("80", 80), ("200", 80)):
         monkeypatch.setenv("COLUMNS", columns)
@@ -56,6 +48,10 @@ def test_help_fits_the_terminal_and_80_columns(capsys, monkeypatch):
                 cli.main([*command.split(), "--help"])
             out, errors = capsys.readouterr()
             assert errors == "" and max(map(len, out.splitlines())) <= most, command
+    assert cli.main(["-h"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 60 and any("--source" in line for line in lines), "the usual options, on one screen"
+    assert lines[-1].startswith("edge-sr --help lists all options")
 
 
 @pytest.mark.parametrize("options", [[], ["--measure"]])
@@ -77,17 +73,6 @@ def test_models_are_listed_with_their_errors_and_run_times(options, bundle, limi
 def test_a_demo_that_ends_before_its_first_tap_says_so(files, capsys):
     assert cli.main(["demo", "--model", f"{files}/tiny.onnx", "--duration-s", "0.2"]) == 0
     assert capsys.readouterr().out == "\nnone of 4 taps scored: the run ended before a tap had a pattern\n"
-
-
-@pytest.fixture
-def there(tmp_path):
-    """Folder with what the refused commands name."""
-    write_model(tmp_path / "other.onnx", make_contract(pitch_mm=5.0))
-    (tmp_path / "kept.npz").write_text("old")
-    (tmp_path / "kept.jsonl").write_text("old")
-    save_sensor_file(tmp_path / "s.toml", SensorFile("XR1944", sensors={"4": SensorEntry()}))
-    write_recording(tmp_path / "moving.npz", range(0, 2000, 10))
-    return tmp_path
 
 
 KNOWN = "--model {files}/tiny.onnx --baseline {files}/zero.json"
@@ -121,21 +106,15 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, f"{NONE} --sink zenoh:a//b", ["'a//b'", "words with '/' between"]),
     ],
 )
-def test_a_refusal_is_one_line_with_its_code_and_all_files_stay(code, typed, words, files, there):
-    before = {path.name: path.read_bytes() for path in there.iterdir()}
-    assert_refused(run(*typed.format(files=files, tmp=there).split(" ")), code, *words)
-    assert {path.name: path.read_bytes() for path in there.iterdir()} == before
-
-
-def test_several_adapters_without_source_are_3_and_not_emulated(plugged, capsys):
-    ports = ["/dev/ttyUSB0", "/dev/ttyUSB1"]
-    plugged += [Port(path, (0x0403, 0x6015), f"S{path[-1]}", "adapter") for path in ports]
-    plugged.append(Port("/dev/ttyS9", None, None, "n/a"))
-    assert cli.main(["--sink", "jsonl:-"]) == 3
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1
-    for word in ("--source demo", "/dev/ttyS9", *ports):
-        assert word in err
+def test_a_refusal_is_one_line_with_its_code_and_all_files_stay(code, typed, words, files, tmp_path):
+    write_model(tmp_path / "other.onnx", make_contract(pitch_mm=5.0))
+    (tmp_path / "kept.npz").write_text("old")
+    (tmp_path / "kept.jsonl").write_text("old")
+    save_sensor_file(tmp_path / "s.toml", SensorFile("XR1944", sensors={"4": SensorEntry()}))
+    write_recording(tmp_path / "moving.npz", range(0, 2000, 10))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert_refused(run(*typed.format(files=files, tmp=tmp_path).split(" ")), code, *words)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_full_disk_is_5_after_the_summary(files):
@@ -151,11 +130,20 @@ def test_a_full_disk_is_5_after_the_summary(files):
 
 def test_of_a_recording_a_few_free_scans_are_enough(files, tmp_path):
     begins_in_contact = write_recording(tmp_path / "held.npz", [3000] * 50 + [0] * 40)
-    done = run("baseline", "--source", f"replay:{begins_in_contact}", "--out", tmp_path / "free.json")
+    zero = tmp_path / "free.json"
+    zero.write_text('{"format": "tactile-baseline"}')
+    done = run("baseline", "--source", f"replay:{begins_in_contact}", "--out", zero)
     assert done.returncode == 0 and "sensor 4: zeroed from its scans 5" in done.stderr
     assert done.stderr.count("where the pad is still and pressed least\n") == 1
-    assert np.abs(load_baselines(tmp_path / "free.json")["4"].counts - BASELINE.counts).max() < 5
-    for paced in ([], ["--paced"]):  # a baseline of a recording without a date has no age
+    assert f"the former file is now {zero}.bak" in done.stdout
+    assert (tmp_path / "free.json.bak").read_text() == '{"format": "tactile-baseline"}'
+    baseline = load_baselines(zero)["4"]
+    assert np.abs(baseline.counts - BASELINE.counts).max() < 5
+    # A baseline of a recording without a date has no age.
+    assert np.isnan(baseline.created_unix_s)
+    with open_recording(files / "rest.npz") as source:
+        assert np.isnan(take_baselines(source)["4"].created_unix_s)
+    for paced in ([], ["--paced"]):
         done = run("replay", begins_in_contact, *paced, "--model", files / "tiny.onnx", "--sink", "jsonl:-")
         got = [one for one in records(done.stdout) if one["state"] != "event"]
         assert {(one["baseline_origin"], one["baseline_age_s"]) for one in got} == {("recording", None)}
@@ -182,7 +170,6 @@ def emulator(files):
 
 
 def follow(emulator, files, *more):
-    """Return a run on the emulator and its first records."""
     process = start(*base_options(files), "--source", f"slcan:{emulator.port}", "--sink", "jsonl:-", *more)
     return process, [process.stdout.readline() for _ in range(10)]
 
@@ -332,6 +319,7 @@ def write_parts(path, *parts):
     """Write a recording of (scans, counts over rest) parts, as the vendor's logger does, without times."""
     felt = np.array([felt + np.zeros((3, 4, 4)) for scans, felt in parts for _ in range(scans)])
     noise = np.random.default_rng(0).normal(0, 2, felt.shape)
+    path.parent.mkdir(exist_ok=True)
     return write_counts(path, np.rint(REST + felt + noise).astype(int))
 
 
@@ -340,52 +328,32 @@ def moving(scans):
     return [(1, GRIP * (1 + 0.04 * np.sin(number / 3))) for number in range(scans)]
 
 
-@pytest.fixture
-def folder(tmp_path):
-    write_model(tmp_path / "tiny.onnx")
-    (tmp_path / "monday").mkdir()
-    (tmp_path / "tuesday").mkdir()
-    return tmp_path
-
-
-def played(folder, *arguments):
-    done = run("replay", *arguments, "--model", folder / "tiny.onnx", "--sink", "jsonl:-")
+def played(files, *arguments):
+    done = run("replay", *arguments, "--model", files / "tiny.onnx", "--sink", "jsonl:-")
     assert done.returncode == 0, done.stderr
     return [one for one in records(done.stdout) if one["state"] != "event"], done.stderr
 
 
-def test_the_printed_remedy_for_a_recording_of_a_held_pad_works(folder):
-    held = write_parts(folder / "monday" / "left.csv", *moving(150))
-    released = write_parts(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
-    shown, stderr = played(folder, held, "--rate-hz", "60")
+def test_the_printed_remedy_for_a_recording_of_a_held_pad_works(files, tmp_path):
+    held = write_parts(tmp_path / "monday/left.csv", *moving(150))
+    released = write_parts(tmp_path / "tuesday/released.csv", *moving(90), (90, DRIFT))
+    shown, stderr = played(files, held, "--rate-hz", "60")
     assert not any(one["contact"] or one["trusted"] for one in shown) and {one["state"] for one in shown} != {"idle"}
     first, second = re.findall(r"edge-sr ((?:baseline|replay) .*?)(?:;| shows)", stderr)
-    zero = str(folder / "zero.json")
+    zero = str(tmp_path / "zero.json")
     done = run(*shlex.split(first.replace("OTHER", str(released)).replace("zero.json", zero)))
     assert done.returncode == 0, done.stderr
-    shown, _ = played(folder, *shlex.split(second.replace("zero.json", zero))[1:])
+    shown, _ = played(files, *shlex.split(second.replace("zero.json", zero))[1:])
     assert {one["state"] for one in shown} == {"baseline_in_doubt"} and not any(one["trusted"] for one in shown)
     assert all(one["pattern"] is not None for one in shown)
-    shown, _ = played(folder, released, "--rate-hz", "60")
+    shown, _ = played(files, released, "--rate-hz", "60")
     assert {one["state"] for one in shown[:89]} == {"contact"} and {one["state"] for one in shown[95:]} == {"idle"}
 
 
-def test_a_recordings_baseline_has_no_age_and_the_former_stays(folder):
-    path, zero = write_parts(folder / "left.csv", (120, 0)), folder / "zero.json"
-    zero.write_text('{"format": "tactile-baseline"}')
-    done = run("baseline", "--source", f"replay:{path}", "--rate-hz", "600", "--out", zero)
-    assert done.returncode == 0 and f"the former file is now {zero}.bak" in done.stdout, done.stderr
-    assert (folder / "zero.json.bak").read_text() == '{"format": "tactile-baseline"}'
-    assert json.loads(zero.read_text())["baselines"][0]["created_unix_s"] is None
-    assert np.isnan(load_baselines(zero)["left"].created_unix_s)
-    with open_recording(path, rate_hz=60) as source:
-        assert np.isnan(take_baselines(source)["left"].created_unix_s)
-
-
-def test_a_pad_that_only_recovers_gives_patterns(folder):
+def test_a_pad_that_only_recovers_gives_patterns(files, tmp_path):
     falls = [(1, GRIP * share) for share in (0.8, 0.5, 0.2)]
     recovers = [(1, np.array([0, 0, 30.0 * (1 - n / 35)])[:, None, None]) for n in range(36)]
-    path = write_parts(folder / "left.csv", *moving(20), *falls, *recovers)
-    shown, stderr = played(folder, path, "--rate-hz", "60")
+    path = write_parts(tmp_path / "left.csv", *moving(20), *falls, *recovers)
+    shown, stderr = played(files, path, "--rate-hz", "60")
     assert {one["state"] for one in shown[:21]} == {"contact"} and {one["state"] for one in shown[26:]} == {"idle"}
     assert re.search(r"pressed least; it recovers there: a taxel may be off by \d+ counts", stderr)

@@ -20,6 +20,7 @@ import termios
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -28,8 +29,9 @@ from bridge_samples import write_recording as write_counts
 from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, wait_for, write_model
 
+from edge.api import PadPose, TimedPose
 from edge.cli import main as cli
-from edge.pipeline.commands import RESET, Command, Commands, command_lines, read_stdin, user_commands
+from edge.pipeline.commands import RESET, ZERO, Command, Commands, command_lines, user_commands
 from edge.terminal.progress_bar import progress
 from firmware_bridge.zeroing.baseline import save_baselines
 
@@ -59,15 +61,12 @@ def pipe():
             os.close(end)
 
 
-FORCED_ZERO = Command("zero", None, True)
-
-
 @pytest.mark.parametrize(
     ("pieces", "expected", "refused"),
     [
         ([b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"', b':"reset"}\r\n'], [RESET] * 3, 0),
         ([b"x" * 4000] * 20 + [b'{"cmd": "reset"}\n{"cmd": "reset"}\n'], [RESET], 1),  # a line without end is one
-        ([b'{"cmd": "zero", "sensor": null, "force": true}'], [FORCED_ZERO], 0),  # the end of the pipe ends a line
+        ([b'{"cmd": "zero", "sensor": null, "force": true}'], [Command("zero", None, True)], 0),  # its end ends a line
     ],
 )
 def test_commands_come_as_lines_however_they_are_cut(pipe, pieces, expected, refused):
@@ -98,50 +97,37 @@ def test_other_lines_are_counted(pipe, line):
 
 def test_poses_and_commands_part_and_bad_lines_stop_nothing(pipe):
     """Nobody polls, since the loop may wait for a scan: a pose without a time has that of its arrival."""
-    commands, place, before_ns = lines_of(pipe[0]), '{"cmd": "pose", "x_mm": 1, "y_mm": 2', time.monotonic_ns()
-    lines = f'{place}, "time_ns": 123}}\n{{"cmd": "pose"}}\nnonsense\n{{"cmd": "reset"}}\n{place}}}\n'
-    os.write(pipe[1], lines.encode())
+    commands, before_ns = lines_of(pipe[0]), time.monotonic_ns()
+    whole = {"cmd": "pose", "x_mm": 1.5, "y_mm": 0, "turn_deg": 5, "error_mm": 0.2, "error_deg": 1}
+    ahead_ns = before_ns + 500_000_000
+    whole |= {"sensor": "4", "time_ns": ahead_ns, "holds": True}
+    lines = [json.dumps(whole), '{"cmd": "pose"}', "nonsense", '{"cmd": "reset"}']
+    lines.append('{"cmd": "pose", "x_mm": 1, "y_mm": -2.0}\n')
+    os.write(pipe[1], "\n".join(lines).encode())
     poses = []
     wait_for(lambda: poses.extend(commands.poses.take()) or len(poses) == 2)
-    assert poses[0].time_ns == 123 and before_ns <= poses[1].time_ns <= time.monotonic_ns()
+    assert poses[0] == TimedPose(PadPose(1.5, 0.0, 5.0, 0.2, 1.0), ahead_ns, "4", True)
+    assert poses[1] == TimedPose(PadPose(1, -2), poses[1].time_ns)
+    assert before_ns <= poses[1].time_ns <= time.monotonic_ns()
     assert commands.poll() == [RESET] and (commands.refused, commands.poses.refused) == (1, 1)
     assert commands.poses.take_reasons() == {"x_mm": "a pose is refused: x_mm is missing, expected a number"}
-
-
-def test_a_terminal_and_a_missing_stdin_are_left_alone(stdin):
-    leader, follower = os.openpty()
-    os.write(leader, b'{"cmd": "reset"}\n')
-    with os.fdopen(follower) as terminal:
-        for given in (terminal, None):
-            stdin(given)
-            commands = Commands()
-            with read_stdin(commands):
-                assert commands.poll() == []
-    stdin(terminal)  # closed
-    with read_stdin(commands):
-        assert commands.poll() == []
-    os.close(leader)
 
 
 def test_all_places_are_asked_and_obeyed_in_their_order(stdin, pipe):
     with os.fdopen(os.dup(pipe[0])) as commands:
         stdin(commands)
-        done = []
-
-        def zero(name=None, *, force=False):
-            done.append((name, force))
-
-        runtime = SimpleNamespace(reset=lambda: done.append("reset"), zero=zero)
         with user_commands() as everything:
             os.write(pipe[1], b'nonsense\n{"cmd": "reset"}\n{"cmd": "zero", "sensor": "4", "force": true}\n')
             os.kill(os.getpid(), signal.SIGUSR1)
-            deadline_s = time.monotonic() + 20
-            while len(done) < 3 and time.monotonic() < deadline_s:  # a thread reads stdin
-                for command in everything.poll():
-                    command.carry_out(runtime)
-            assert everything.refused == 1
-    done.remove((None, False))  # the signal's, which may come between those of stdin
-    assert done == ["reset", ("4", True)]
+            got = taken(everything, 4)
+        assert everything.refused == 1
+    with user_commands() as nothing:  # by a stdin that is closed
+        assert nothing.poll() == []
+    got.remove(ZERO)  # the signal's, which may come between those of stdin
+    runtime = Mock()
+    for command in got:
+        command.carry_out(runtime)
+    assert runtime.mock_calls == [call.reset(), call.zero("4", force=True)]
 
 
 TIMEOUT_S = 60.0
@@ -286,15 +272,9 @@ def test_a_replay_shows_the_live_line(tmp_path, monkeypatch, capfd, window, opti
     assert ("REPLAY | " in window.said()) == lives
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """Clock of the bars, which goes on as a test sets `now_s`."""
-    clock = SimpleNamespace(now_s=100.0)
+def test_a_bar_comes_after_two_seconds_on_a_terminal_alone(window, monkeypatch):
+    clock, pipe = SimpleNamespace(now_s=100.0), io.StringIO()
     monkeypatch.setattr("tqdm.std.time", lambda: clock.now_s)
-    return clock
-
-
-def test_a_bar_comes_after_two_seconds_and_leaves_no_trace(window, clock):
     with progress("poses", 400, "pose", done=100, stream=window.stream) as bar:
         clock.now_s += 1.9
         bar.update(38)
@@ -306,10 +286,6 @@ def test_a_bar_comes_after_two_seconds_and_leaves_no_trace(window, clock):
         os.close(window.ours)  # a window that is closed ends no work
         window.ours = None
         bar.update()
-
-
-def test_no_bar_without_a_terminal(clock):
-    pipe = io.StringIO()
     with progress("poses", 400, "pose", stream=pipe) as bar:
         clock.now_s += 9
         bar.update()

@@ -1,6 +1,7 @@
 """`edge-sr convert`: all that a recording holds is in the new file, and nothing is replaced, lost or left behind."""
 
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -40,9 +41,14 @@ def made(tmp_path) -> tuple[Path, list[Result]]:
     return path, results
 
 
-def test_arrays_hold_scans_results_maps_baselines_and_poses(made):
+def test_arrays_hold_all_but_what_is_named_as_left_out(made, capsys):
     path, results = made
     arrays = arrays_of(path)
+    left_out = set(re.findall(r"\w+", capsys.readouterr().out.partition("not in it: ")[2]))
+    table = (ROOT / "docs" / "recordings.md").read_text().partition("| [`.npz`]")[2].partition("\n")[0]
+    assert not left_out & arrays.keys()
+    for name in record(results[-1], {}).keys() - arrays.keys() - {"poses"}:  # these of models that take them alone
+        assert name in left_out and name in table
     results = sorted(results, key=lambda one: one.scan.time_ns)
     order = np.argsort(arrays["time_ns"], kind="stable")
     rows = {name: array[order] for name, array in arrays.items() if array.shape[:1] == (len(results),)}
@@ -69,16 +75,6 @@ def test_arrays_hold_scans_results_maps_baselines_and_poses(made):
                 assert not rows[field.name][row].any()
     assert set(arrays["origin"]) == {"emulated"} and arrays["pose_sensor"].tolist() == ["4"] * 6
     assert arrays["pose"][1].tolist() == [4.0, -4 / 3, 40.0, 0.4, 0.5]
-
-
-def test_each_key_of_a_record_is_an_array_or_named_as_left_out(made, capsys):
-    path, results = made
-    arrays = arrays_of(path)
-    left_out = set(re.findall(r"\w+", capsys.readouterr().out.partition("not in it: ")[2]))
-    table = (ROOT / "docs" / "recordings.md").read_text().partition("| [`.npz`]")[2].partition("\n")[0]
-    assert not left_out & arrays.keys()
-    for name in record(results[-1], {}).keys() - arrays.keys() - {"poses"}:  # these of models that take them alone
-        assert name in left_out and name in table
 
 
 def test_a_csv_has_the_id_maps_order_and_says_what_is_missing(made, tmp_path, capsys):
@@ -133,25 +129,22 @@ def test_what_cannot_be_converted_is_one_line_and_makes_nothing(words, code, sai
     assert {path.name: path.stat().st_size for path in tmp_path.iterdir()} == before
 
 
-RUN = """
-import resource, signal, sys
-from edge.__main__ import main
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-sys.exit(main(["convert", *sys.argv[2:]]))
-"""
-
-
-def test_a_full_disk_and_ctrl_c_leave_nothing(tmp_path):
+def test_a_full_disk_and_ctrl_c_leave_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     scans = [make_scan(number, press_counts=3000, noise=number) for number in range(300)]
     record_into(tmp_path / "press.mcap", make_results(scans))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
     for new in ("new.npz", "new.csv"):
-        command = [sys.executable, "-B", "-c", RUN, "10000", "press.mcap", new]  # bytecode would be cut off, too
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-        assert (done.returncode, done.stdout) == (5, "") and f"cannot write {new}: File too large" in done.stderr
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+        try:
+            assert convert("press.mcap", new) == 5
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        out, err = capsys.readouterr()
+        assert out == "" and f"cannot write {new}: File too large" in err
         assert [path.name for path in tmp_path.iterdir()] == ["press.mcap"]
-    command = [sys.executable, "-c", RUN, str(10**9), "press.mcap", "new.npz"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    command = [sys.executable, "-m", "edge", "convert", "press.mcap", "new.npz"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         while not any(path.stat().st_size for path in tmp_path.glob(".new.npz.*/new.npz")) and process.poll() is None:
             time.sleep(0.001)
         process.send_signal(signal.SIGINT)

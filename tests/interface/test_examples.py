@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import trimesh
@@ -139,20 +140,10 @@ def at_once(stop_on_area, limits):
     return stop_on_area
 
 
-class Gripper:
-    def __init__(self):
-        self.done = []
-
-    def close(self):
-        self.done.append("close")
-
-    def stop(self):
-        self.done.append("stop")
-
-
 def grip_of(module, **settings):
-    gripper = Gripper()
-    return module.Grip(gripper, 20.0, **({"most_counts": 20_000, "oldest_ms": 100} | settings)), gripper
+    done = []
+    gripper = SimpleNamespace(close=lambda: done.append("close"), stop=lambda: done.append("stop"))
+    return module.Grip(gripper, 20.0, **({"most_counts": 20_000, "oldest_ms": 100} | settings)), done
 
 
 def reading(state="idle", sensor="4", **said):
@@ -177,47 +168,47 @@ WRONG = {
 
 @pytest.mark.parametrize("words", WRONG)
 def test_the_gripper_neither_begins_nor_goes_on_by_a_bad_reading(at_once, words):
-    grip, gripper = grip_of(at_once, oldest_ms=2000)
+    grip, done = grip_of(at_once, oldest_ms=2000)
     grip.follow(reading(**WRONG[words]))
-    assert gripper.done == [] and grip.why.startswith("it never began: ") and words in grip.why
+    assert done == [] and grip.why.startswith("it never began: ") and words in grip.why
     grip.follow(reading())
     grip.follow(reading("contact", area_mm2=19.0))
-    assert gripper.done == ["close"]
+    assert done == ["close"]
     grip.follow(reading(**WRONG[words]))
-    assert gripper.done == ["close", "stop"] and words in grip.why and not grip.reached
+    assert done == ["close", "stop"] and words in grip.why and not grip.reached
 
 
 def test_it_begins_when_every_sensor_is_free_and_any_stops_it(stop_on_area):
-    grip, gripper = grip_of(stop_on_area, oldest_ms=20_000)
+    grip, done = grip_of(stop_on_area, oldest_ms=20_000)
     grip.follow(reading(sensor="left", age_ms=1000))
     grip.follow(reading(sensor="left", age_ms=600))
-    assert gripper.done == []  # the other one may not have sent yet
+    assert done == []  # the other one may not have sent yet
     grip.follow(reading("zeroing", "right", force_counts=None))
     grip.follow(reading(sensor="left"))
     grip.follow(reading("contact", "right", area_mm2=5.0))
     grip.follow(reading(sensor="left"))
-    assert gripper.done == []
+    assert done == []
     grip.follow(reading(sensor="right"))
-    assert gripper.done == ["close"]
+    assert done == ["close"]
     grip.follow(reading("contact", "right", area_mm2=20.0, trusted=True))
-    assert gripper.done == ["close", "stop"] and grip.reached
+    assert done == ["close", "stop"] and grip.reached
 
 
 def test_a_silent_sensor_stops_it_though_the_other_still_sends(at_once, monkeypatch):
-    alone, its_gripper = grip_of(at_once, name="left")  # of several sensors one alone may be gone by
+    alone, its_own = grip_of(at_once, name="left")  # of several sensors one alone may be gone by
     alone.follow(reading("contact", "right", area_mm2=50.0))
     alone.follow(reading(sensor="left"))
     alone.follow(reading("zeroing", "right", force_counts=None))
-    assert its_gripper.done == ["close"]
-    grip, gripper = grip_of(at_once, oldest_ms=2000)
+    assert its_own == ["close"]
+    grip, done = grip_of(at_once, oldest_ms=2000)
     for age_ms in (1000, 900):
         for sensor in ("left", "right"):
             grip.follow(reading(sensor=sensor, age_ms=age_ms))
-    assert gripper.done == ["close"]
+    assert done == ["close"]
     later_ns = time.monotonic_ns() + 3 * 10**9
     monkeypatch.setattr(time, "monotonic_ns", lambda: later_ns)
     grip.follow(reading(sensor="left"))
-    assert gripper.done == ["close", "stop"] and grip.why.startswith("no reading of sensor right for 3")
+    assert done == ["close", "stop"] and grip.why.startswith("no reading of sensor right for 3")
 
 
 class Live(FakeLink):
@@ -247,13 +238,13 @@ def test_the_gripper_stands_still_however_it_ends(at_once, sensors, settings, wo
     told = settings.pop("told", ())
     link = Live([[make_scan(n)] for n in range(30 if told else 10)], **settings)
     link.told = told
-    grip, gripper = grip_of(at_once, oldest_ms=500)
+    grip, done = grip_of(at_once, oldest_ms=500)
     entries = {name: SensorEntry(baseline=replace(BASELINE, sensor=name)) for name in sensors}
     with Source(link, sensor_file=SensorFile(sensors=entries)) as source:
         grip.run(source, FakeModel(), 60)
     assert words in grip.why
     begun = ["close"] if len(sensors) == 1 else []
-    assert gripper.done[: len(begun)] == begun and set(gripper.done[len(begun) :]) == {"stop"}
+    assert done[: len(begun)] == begun and set(done[len(begun) :]) == {"stop"}
 
 
 @pytest.mark.night
