@@ -203,7 +203,7 @@ def test_each_kind_of_result_is_told(sink):
     for result in every_kind():
         published.clear()
         sink.write(result, {})
-        data = [one["data"] for one in published if type(one.get("data")) in (int, str)]
+        data = [one["data"] for one in published if one.keys() == {"data"} and type(one["data"]) is not float]
         known = {None: -1, False: 0, True: 1}[result.trusted]
         assert data[:2] == [known, result.state] or (result.state == "dropped" and data == [])
         frame = result.scan.sensor if result.source == "device" else f"{result.source}/{result.scan.sensor}"
@@ -211,7 +211,7 @@ def test_each_kind_of_result_is_told(sink):
     sink.write(contact(0), {})
     published.clear()
     sink.write(without_pattern(contact(1), state="baseline_in_doubt", contact=None), {})
-    images = [pixels(one | {"data": bytes(one["data"]).hex()}) for one in published if one.get("height") == 40]
+    images = [pixels(one) for one in published if one.get("height") == 40]
     assert len(images) == 2 and np.isnan(images).all()
 
 
@@ -242,7 +242,7 @@ def test_force_torque_and_numbers_of_a_model_with_traction(sink):
     (wrench,) = [one["wrench"] for one in published if "wrench" in one]
     assert list(wrench["force"].values()) == list(result.wrench.force_n)
     assert list(wrench["torque"].values()) == [torque / 1000 for torque in result.wrench.torque_n_mm]
-    points, contacts = [one | {"data": bytes(one["data"]).hex()} for one in published if "fields" in one]
+    points, contacts = [one for one in published if "fields" in one]
     check_points(points, result)
     check_contacts(contacts, result)
     numbers = dict(zip(NUMBERS, [one["data"] for one in published if type(one.get("data")) is float], strict=True))
