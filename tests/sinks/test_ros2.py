@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ros2_samples import ENVIRONMENT, TAG, Listener, Speaker, contact, keep_published, sink, without_pattern
+from ros2_samples import ENVIRONMENT, TAG, Listener, contact, keep_published, sink, speaker, without_pattern
 
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
@@ -272,16 +272,16 @@ def test_frames_reach_late_readers_and_commands_come_back():
         return command in asked
 
     topics = [("skin/zero", STRING), ("skin/reset", STRING)]
-    with Speaker(*topics) as speaker:
+    with speaker(*topics) as say:
         for topic, word, command in (
             ("skin/zero", "left", Command("zero", "left")),
             ("skin/zero", "", Command("zero")),
             ("skin/reset", "", Command("reset")),
         ):
             said = topic, STRING, {"data": word}
-            wait_for(lambda said=said, command=command: speaker.say(*said) or waits_for(command))
+            wait_for(lambda said=said, command=command: say(*said) or waits_for(command))
         said = "skin/zero", STRING, {"data": "a\nb"}
-        wait_for(lambda: speaker.say(*said) or waits_for(None) or commands.refused)
+        wait_for(lambda: say(*said) or waits_for(None) or commands.refused)
     sink.close()
     assert commands.poll() == [], "asked of a sink that is closed"
 
@@ -311,9 +311,8 @@ def test_a_node_that_describes_types_as_fast_dds_does_is_heard():
             np.testing.assert_allclose(pixels(message), talker.wrote["4", stamp_ns(message)].pattern / 1e3, rtol=1e-6)
 
 
-def test_a_wrench_ends_with_its_contact_and_is_never_nan():
+def test_a_wrench_ends_with_its_contact_and_is_never_nan(sink):
     published = []
-    sink = Ros2Sink("skin", make_contract(), fake_source("emulated"), environment=ENVIRONMENT)
     keep_published(sink, published)
 
     def forces():
@@ -336,7 +335,7 @@ def test_a_wrench_ends_with_its_contact_and_is_never_nan():
     assert forces() == [z_n]
     sink.tell(lost, {})
     (said,) = (json.loads(one["data"]) for one in published if str(one.get("data")).startswith("{"))
-    assert (said["event"], said["source"]) == ("lost", "emulated")
+    assert (said["event"], said["source"]) == ("lost", "device")
     assert forces() == [], "nothing is known, and there is no number for that"
     sink.write(replace(idle, state="incomplete", contact=None), {})
     sink.close()
