@@ -17,22 +17,22 @@ from bridge_samples import write_recording
 from cli_samples import start
 from edge_samples import ROOT, ended, fake_source, make_scan, unpack, wait_for, write_model
 from test_listening import reachable
-from zenoh_samples import CONTRACT, consume, endpoint, listening, make_results
+from zenoh_samples import CONTRACT, consumer, endpoint, listening, make_results
 
 from edge.api import Event, SinkError
 from edge.cli.main import main
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
 
-__all__ = ["consume", "endpoint"]
+__all__ = ["consumer", "endpoint"]
 
 zenoh = pytest.importorskip("zenoh")
 
 
 class TestMessages:
-    def test_a_new_pattern_has_all_its_maps_and_writers_come_and_go(self, endpoint, consume):
+    def test_a_new_pattern_has_all_its_maps_and_writers_come_and_go(self, endpoint, consumer):
         """The rest of each result is in tests/sinks/test_every_sink.py."""
-        consumer, results = consume(endpoint), make_results(40)
+        results = make_results(40)
         sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source())
         for result in results:
             sink.write(result, {})
@@ -73,8 +73,8 @@ class TestMessages:
 
 
 class TestWhoComesAndGoes:
-    def test_a_reader_that_stands_still_holds_up_nobody(self, endpoint, consume):
-        consumer, result = consume(endpoint), make_results(2)[1]
+    def test_a_reader_that_stands_still_holds_up_nobody(self, endpoint, consumer):
+        result = make_results(2)[1]
         sink = ZenohSink(f"grip?connect={endpoint}", fake_source("device"))
         wait_for(lambda: sink.write(result, {}) or sink.trouble is None)
         consumer.process.send_signal(signal.SIGSTOP)
@@ -156,9 +156,9 @@ def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, endpoint, tmp_path):
         sink.close()
 
 
-def test_a_replay_that_waits_for_a_stopped_peer_still_ends(endpoint, consume, tmp_path):
+def test_a_replay_that_waits_for_a_stopped_peer_still_ends(endpoint, consumer, tmp_path):
     """Five seconds are promised; a busy machine may take longer."""
-    model, consumer = write_model(tmp_path / "tiny.onnx", CONTRACT), consume(endpoint)
+    model = write_model(tmp_path / "tiny.onnx", CONTRACT)
     counts = make_scan(0).counts + np.random.default_rng(1).integers(-2, 3, (8000, 3, 4, 4))
     counts[110:, 2] += ((2000 + 7 * np.arange(7890) % 997) // 16)[:, None, None]
     replay = ["replay", write_recording(tmp_path / "long.csv", counts), "--rate-hz", 2000, "--model", model]

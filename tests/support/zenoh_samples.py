@@ -19,9 +19,7 @@ CONTRACT = make_pad_contract(interval_factor=1.6)
 # Prints each message as it comes: who came and went, or key, encoding, writer and payload; all from one thread.
 CONSUME = """
 import json, sys, time, zenoh
-config = zenoh.Config()
-config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
+from zenoh_samples import listening
 def tell(*words):
     print(json.dumps(words), flush=True)
 def take(sample):
@@ -30,7 +28,7 @@ def take(sample):
 def follow(token):
     tell("came" if token.kind == zenoh.SampleKind.PUT else "went", str(token.key_expr))
 here = lambda callback: zenoh.handlers.Callback(callback, indirect=False)
-with zenoh.open(config) as session:
+with listening(sys.argv[1]) as session:
     session.liveliness().declare_subscriber("grip/alive/*", here(follow), history=True)
     session.declare_subscriber("grip/**", here(take))
     tell("listens")
@@ -85,25 +83,14 @@ class Consumer:
         messages = [(*words[1:-1], bytes.fromhex(words[-1])) for words in told if words[0] == "got"]
         return messages, [words for words in told if words[0] != "got"]
 
-    def stop(self):
-        self.process.kill()
-        self.process.wait()
-        self.reader.join()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
 
 @pytest.fixture
-def consume():
-    consumers = []
-
-    def start(endpoint):
-        consumers.append(Consumer(endpoint))
-        return consumers[-1]
-
-    yield start
-    for consumer in consumers:
-        consumer.stop()
+def consumer(endpoint):
+    made = Consumer(endpoint)
+    with made.process:
+        yield made
+        made.process.kill()
+        made.reader.join()
 
 
 def make_results(count):
