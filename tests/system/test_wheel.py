@@ -49,17 +49,6 @@ def fresh(tmp_path_factory, wheels):
 
 
 @pytest.fixture(scope="module")
-def demo(fresh, tmp_path_factory):
-    """The installed runtime's demo with its first tap, which plays while other tests run, and its records' file."""
-    records = tmp_path_factory.mktemp("demo") / "records.jsonl"
-    command = [str(fresh / "edge-sr"), "--source", "demo", "--sink", f"jsonl:{records}", "--duration-s", "6"]
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, text=True, env=without_checkout(), **pipes) as process:
-        yield process, records
-        process.kill()
-
-
-@pytest.fixture(scope="module")
 def both(fresh, wheels):
     """The same environment with the second wheel as well, without torch and the like: used by the last tests alone."""
     pip(fresh.parent, *INSTALL, "--no-deps", wheels[1])
@@ -89,7 +78,7 @@ def run(command, **environment):
     return done.stdout
 
 
-def test_it_holds_the_runtime_alone_with_types_for_a_checker(fresh, demo, tmp_path):
+def test_it_holds_the_runtime_alone_with_types_for_a_checker(fresh, tmp_path):
     installed = {package["name"].lower() for package in json.loads(pip(fresh.parent, "list", "--format", "json"))}
     assert "tactile-edge-sr" in installed and not NOT_IN_THE_RUNTIME & installed
     (packages,) = fresh.parent.glob("lib/python*/site-packages")
@@ -161,12 +150,11 @@ def test_both_wheels_together_are_the_packages_of_a_checkout(wheels):
     assert of_packages[0] | of_packages[1] >= set(kept.stdout.splitlines())
 
 
-def test_the_demo_runs_from_the_wheel(demo):
-    process, records = demo
-    out, err = process.communicate(timeout=240)
-    assert process.returncode == 0, err
-    assert "PSNR" in out
-    lines = [json.loads(line) for line in records.read_text().splitlines()]
+def test_the_demo_runs_from_the_wheel(fresh, tmp_path):
+    done = ended(tmp_path, fresh / "edge-sr", "--source", "demo", "--sink", "jsonl:records", "--duration-s", "6")
+    assert done.returncode == 0, done.stderr
+    assert "PSNR" in done.stdout
+    lines = [json.loads(line) for line in (tmp_path / "records").read_text().splitlines()]
     assert {line["source"] for line in lines} == {"emulated"}
     assert any(line["pattern"] for line in lines)
 
