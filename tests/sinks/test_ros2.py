@@ -198,8 +198,7 @@ def test_who_joins_late_stops_or_dies_holds_up_nobody(sink):
 
 
 def test_each_kind_of_result_is_told(sink):
-    published = []
-    keep_published(sink, published)
+    published = keep_published(sink)
     for result in every_kind():
         published.clear()
         sink.write(result, {})
@@ -217,8 +216,7 @@ def test_each_kind_of_result_is_told(sink):
 
 def test_a_force_of_which_a_part_is_not_known_is_no_wrench(sink):
     """Controllers refuse NaN, and counts are no newtons."""
-    published, result = [], contact(1)
-    keep_published(sink, published, WRENCH, FLOAT)
+    published, result = keep_published(sink, WRENCH, FLOAT), contact(1)
     vendors = replace(result, scan=replace(result.scan, vendor=VENDOR), force_n=2.0)
     for one, wrenches in (
         (vendors, 1),
@@ -234,9 +232,7 @@ def test_a_force_of_which_a_part_is_not_known_is_no_wrench(sink):
 
 
 def test_force_torque_and_numbers_of_a_model_with_traction(sink):
-    published = []
-    keep_published(sink, published, WRENCH, CLOUD, FLOAT)
-    result = make_wrench_result()
+    published, result = keep_published(sink, WRENCH, CLOUD, FLOAT), make_wrench_result()
     result = replace(result, deviation=result.pattern / 10)
     sink.write(result, {})
     (wrench,) = [one["wrench"] for one in published if "wrench" in one]
@@ -253,7 +249,7 @@ def test_force_torque_and_numbers_of_a_model_with_traction(sink):
 
 def test_frames_reach_late_readers_and_commands_come_back():
     frames = {"left": PadFrame("tool0", (0.0, 12.5, 50.0), (0.0, 1.0, 0.0, 0.0)), "far": PadFrame("base")}
-    commands = Commands()
+    commands, asked = Commands(), []
     sink = Ros2Sink("skin", make_contract(), fake_source(frames=frames), commands, environment=ENVIRONMENT)
     for _ in range(2):
         sink.write(contact(1, sensor="left", source="emulated"), {})
@@ -265,23 +261,18 @@ def test_frames_reach_late_readers_and_commands_come_back():
             "translation": {"x": 0.0, "y": 0.0125, "z": 0.05},
             "rotation": {"x": 0.0, "y": 1.0, "z": 0.0, "w": 0.0},
         }
-    asked = []
 
-    def waits_for(command):
-        asked.extend(commands.poll())
-        return command in asked
+    with speaker(("skin/zero", STRING), ("skin/reset", STRING)) as say:
 
-    topics = [("skin/zero", STRING), ("skin/reset", STRING)]
-    with speaker(*topics) as say:
-        for topic, word, command in (
-            ("skin/zero", "left", Command("zero", "left")),
-            ("skin/zero", "", Command("zero")),
-            ("skin/reset", "", Command("reset")),
-        ):
-            said = topic, STRING, {"data": word}
-            wait_for(lambda said=said, command=command: say(*said) or waits_for(command))
-        said = "skin/zero", STRING, {"data": "a\nb"}
-        wait_for(lambda: say(*said) or waits_for(None) or commands.refused)
+        def heard(topic, word, command):
+            say(topic, STRING, {"data": word})
+            asked.extend(commands.poll())
+            return command in asked or (command is None and commands.refused)
+
+        wait_for(lambda: heard("skin/zero", "left", Command("zero", "left")))
+        wait_for(lambda: heard("skin/zero", "", Command("zero")))
+        wait_for(lambda: heard("skin/reset", "", Command("reset")))
+        wait_for(lambda: heard("skin/zero", "a\nb", None))
     sink.close()
     assert commands.poll() == [], "asked of a sink that is closed"
 
@@ -312,8 +303,7 @@ def test_a_node_that_describes_types_as_fast_dds_does_is_heard():
 
 
 def test_a_wrench_ends_with_its_contact_and_is_never_nan(sink):
-    published = []
-    keep_published(sink, published)
+    published = keep_published(sink)
 
     def forces():
         found = [one["wrench"]["force"]["z"] for one in published if "wrench" in one]

@@ -56,8 +56,9 @@ def without_pattern(result, **changes):
     return replace(result, scan=scan, pattern=None, deviation=None, **changes)
 
 
-def keep_published(sink, kept, *names):
-    """Keep the messages of a sink, or those of some types, as decoded by the rules, in place of publishing them."""
+def keep_published(sink, *names):
+    """Return the messages of a sink, or those of some types, decoded by the rules in place of being published."""
+    kept = []
 
     def keep(writer, data):
         package, _, kind = writer.data_type.__idl_typename__.split(".", 2)
@@ -66,6 +67,7 @@ def keep_published(sink, kept, *names):
             kept.append(ros2_messages.decode(name, data))
 
     sink.publish, sink.is_read = keep, lambda writer: True
+    return kept
 
 
 class Listener:
