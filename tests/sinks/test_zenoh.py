@@ -2,7 +2,6 @@
 
 import json
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 import zenoh_samples
 from bridge_samples import write_recording
-from cli_samples import start
 from edge_samples import ROOT, ended, fake_source, make_scan, unpack, wait_for, write_model
 from test_listening import reachable
 from zenoh_samples import CONTRACT, consumer, endpoint, listening, make_results
@@ -154,22 +152,3 @@ def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, endpoint, tmp_path):
         time.sleep(0.3)  # for a call to another, were there one
         assert sink.zid not in map(str, other.info.peers_zid())
         sink.close()
-
-
-def test_a_replay_that_waits_for_a_stopped_peer_still_ends(endpoint, consumer, tmp_path):
-    """Five seconds are promised; a busy machine may take longer."""
-    model = write_model(tmp_path / "tiny.onnx", CONTRACT)
-    counts = make_scan(0).counts + np.random.default_rng(1).integers(-2, 3, (8000, 3, 4, 4))
-    counts[110:, 2] += ((2000 + 7 * np.arange(7890) % 997) // 16)[:, None, None]
-    replay = ["replay", write_recording(tmp_path / "long.csv", counts), "--rate-hz", 2000, "--model", model]
-    sinks = ["--sink", "jsonl:-", "--sink", f"zenoh:grip?connect={endpoint}"]
-    with ended(start(*replay, *sinks, "--every-scan")) as program:
-        while consumer.next()[0] != "got":
-            pass
-        consumer.process.send_signal(signal.SIGSTOP)
-        # What zenoh has no room for holds up everything, for five seconds at most.
-        while select.select([program.stdout], [], [], 1.0)[0] and os.read(program.stdout.fileno(), 1 << 20):
-            pass
-        program.send_signal(signal.SIGTERM)
-        words = program.communicate()[1]
-    assert program.returncode == 0 or (program.returncode == -signal.SIGKILL and "ended by force" in words)

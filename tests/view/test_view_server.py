@@ -11,7 +11,6 @@ from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
-from bridge_samples import make_counts, write_recording
 from edge_samples import wait_for
 from view_samples import HANDSHAKE, TIMEOUT_S, frame, get, live_page, page, refused_with
 from websockets.exceptions import ConnectionClosed
@@ -109,13 +108,6 @@ def test_a_port_in_use_is_one_line_and_5(capsys):
         f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: Address already in use; "
         "name another port with --view, 0 for any free one, or an address of this machine with --view-host\n"
     )
-
-
-def test_a_recording_with_a_page_is_played_as_if_live(tmp_path):
-    path = write_recording(tmp_path / "press.csv", make_counts(20), rate_hz=1000)
-    records, begun_ns = tmp_path / "out.jsonl", time.monotonic_ns()
-    assert main(["replay", str(path), "--sink", f"jsonl:{records}", "--view", "0"]) == 0
-    assert json.loads(records.read_text().splitlines()[0])["time_ns"] >= begun_ns
 
 
 GOODBYE = b"\x88\x80\x00\x00\x00\x00"
