@@ -10,8 +10,6 @@ import numpy as np
 import orjson
 import pytest
 from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from sink_samples import CONTRACT, RUN, make_results, make_sure_results
 
 from edge.api import Runtime, SinkError
@@ -38,6 +36,8 @@ def test_each_result_is_written_whole_though_patterns_repeat(tmp_path):
         sink.write(result, RUN)
         expected += record_line(result, None if number > 1 else RUN | {"unwritten": 0})  # the first of each sensor
         assert path.read_bytes() == expected, "there as soon as it is written"
+        told = json.loads(expected.splitlines()[-1], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+        assert result.pattern is None or (np.array(told["pattern"], np.float32) == result.pattern).all()
     sink.close()
 
 
@@ -109,18 +109,6 @@ def test_what_the_vendor_says_is_told_where_it_does():
     assert not {"vendor_force_n", "temperature_k"} & set(silent)
     calibrated = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, counts_per_newton=100.0)
     assert calibrated.push(replace(make_scan(press_counts=50), vendor=vendor)).force_n == 0.5  # the user's own wins
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.floats(-(2.0**99), 2.0**99, width=32, allow_subnormal=False), min_size=4, max_size=4))
-def test_patterns_keep_seven_decimals_and_are_json(values):
-    result = make_results(3)[4]
-    pattern = np.array(values, dtype=np.float32).reshape(2, 2)
-    object.__setattr__(result, "pattern", pattern)
-    line = record_line(result, {})
-    got = json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))["pattern"]
-    np.testing.assert_allclose(got, pattern, rtol=2e-7, atol=0.51e-7)
-    assert line.endswith(b"}\n") and line.count(b"\n") == 1
 
 
 def test_a_slow_reader_holds_up_nothing_and_its_loss_is_counted(tmp_path):

@@ -61,15 +61,11 @@ def pip(environment, *words, **variables):
     return run([*command, *words], **variables)
 
 
-def without_checkout():
-    """The environment without PYTHONPATH: a checkout on it would lend what the wheel lacks."""
-    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-
-
 def ended(folder, *command, **environment):
-    """Run a command in a folder to its end, whatever that is."""
+    """Run a command in a folder to its end, without PYTHONPATH: a checkout on it would lend what the wheel lacks."""
+    variables = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | environment
     settings = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "timeout": 240}
-    return subprocess.run(list(map(str, command)), cwd=folder, env=without_checkout() | environment, **settings)
+    return subprocess.run(list(map(str, command)), cwd=folder, env=variables, **settings)
 
 
 def run(command, **environment):
