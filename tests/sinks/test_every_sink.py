@@ -147,6 +147,7 @@ def test_the_last_sinks_failure_or_its_readers_end_ends_the_run(tmp_path):
         ("zenoh:a?listen=x", UsageError, "'listen=x' after its key: expected zenoh:KEY, zenoh:KEY?connect="),
         ("zenoh:a?connect=here", UsageError, "'connect=here' after its key"),
         ("zenoh:a?", UsageError, "'' after its key"),
+        *((f"rerun:{target}", UsageError, "rerun:view") for target in ("press.mcap", "127.0.0.1", "")),
         *(
             (text, UsageError, ", ".join(one.text for one in FORMS.values()))
             for text in ("", "jsonl", "jsonl:", "npz:", "csv:a", "status:x", "x")

@@ -314,15 +314,10 @@ def test_a_wrench_ends_with_its_contact_and_is_never_nan(sink):
     idle = without_pattern(contact(1), state="idle", contact=False)
     lost = Event(time.monotonic_ns(), "lost", None, "the plug is out")
     z_n = pressed.wrench.force_n[2]
-    sink.write(pressed, {})
-    assert forces() == [z_n]
-    sink.write(replace(idle, state="dropped"), {})  # a newer scan waits
-    assert forces() == []
-    sink.write(idle, {})
-    sink.write(idle, {})
-    assert forces() == [0.0]
-    sink.write(pressed, {})
-    assert forces() == [z_n]
+    newer_waits = replace(idle, state="dropped")
+    for result, shown in ((pressed, [z_n]), (newer_waits, []), (idle, [0.0]), (idle, []), (pressed, [z_n])):
+        sink.write(result, {})
+        assert forces() == shown
     sink.tell(lost, {})
     (said,) = (json.loads(one["data"]) for one in published if str(one.get("data")).startswith("{"))
     assert (said["event"], said["source"]) == ("lost", "device")

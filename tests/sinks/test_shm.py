@@ -56,9 +56,7 @@ class TestWhatIsThere:
         said = fields(half)
         assert said["sensor"].rstrip(b"\0") == b"4" and said["model"].rstrip(b"\0") == b"fake"
         assert (said["time_ns"], said["scan"], said["device_time_ns"], said["sequence"]) == (80_000_000, 7, -1, 1)
-        # emulated, contact
-        assert (said["source"], said["state"], said["contact"], said["taps_used"]) == (3, 4, 1, 1)
-        assert (said["has_pattern"], said["has_deviation"], said["reused_from"], said["filled"]) == (1, 1, -1, 0)
+        assert (said["has_deviation"], said["reused_from"], said["taps_used"]) == (1, -1, 1)
         assert (said["dead"], said["fresh"], said["renewed"]) == (0, 0xFFFF, 0x7FFE)
         assert (said["force_counts"], said["area_mm2"]) == (3000.0, pytest.approx(22.09))
         assert (said["centroid_x_mm"], said["centroid_y_mm"]) == pytest.approx(result.centroid_mm)

@@ -13,7 +13,6 @@ import sys
 import time
 import venv
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -185,30 +184,25 @@ def typed() -> list[str]:
 def run_in(folder: Path, command: str, at_work: str | None = None) -> str:
     """Run a command until it ends, or until it is at work and Ctrl-C; return what it printed."""
     variables = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    shown = ""
     with subprocess.Popen(
-        ["bash", "-c", command], cwd=folder, env=variables, start_new_session=True, text=True, **pipes
+        ["bash", "-c", command], cwd=folder, env=variables, start_new_session=True, **pipes
     ) as process:
         try:
-            shown = "".join(_until(process.stdout, at_work))
-            if at_work is not None:
-                assert at_work in shown, f"{command} ended: {shown[-2000:]}"
-                time.sleep(3)
-                os.killpg(process.pid, signal.SIGINT)
-            rest, _ = process.communicate(timeout=LONGEST_S)
+            for line in process.stdout:
+                if at_work is not None and at_work in line and at_work not in shown:
+                    time.sleep(3)
+                    os.killpg(process.pid, signal.SIGINT)
+                shown += line
+            process.wait(60)
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
+    assert at_work is None or at_work in shown, f"{command} ended: {shown[-2000:]}"
     allowed = {0} if at_work is None else {0, 130, -signal.SIGINT}
-    assert process.returncode in allowed, f"{command}: {(shown + rest)[-2000:]}"
-    return shown + rest
-
-
-def _until(lines, at_work: str | None) -> Iterator[str]:
-    for line in lines if at_work is not None else ():
-        yield line
-        if at_work in line:
-            return
+    assert process.returncode in allowed, f"{command}: {shown[-2000:]}"
+    return shown
 
 
 @pytest.mark.night

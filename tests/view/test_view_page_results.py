@@ -94,19 +94,17 @@ def test_the_pad_is_outlined_where_to_touch_next(open_page):
         shows[0] = idle
         state.to_have_text("idle")
         next_tap.to_have_text("\u2013")
-        arrow, mirrored = ([CENTRE + side * PITCH / 2] * 2 for side in (1, -1))  # the arrow begins at the centre
-        assert not drawn(page, *arrow)
-        shows[0] = replace(idle, next_tap=NextTap(2.35, 2.35, 0.0))
-        next_tap.to_have_text("2.4\u202fmm right, 2.4\u202fmm down")
-        page.wait_for_function(DRAWN, arg=arrow)
-        assert not drawn(page, *mirrored)
-        shows[0] = replace(idle, next_tap=NextTap(-2.35, -2.35, 0.0))
-        next_tap.to_contain_text("2.4\u202fmm left, 2.4\u202fmm up")
-        page.wait_for_function(DRAWN, arg=mirrored)
+        arrows = {side: [CENTRE + side * PITCH / 2] * 2 for side in (1, -1)}  # the arrow begins at the centre
+        assert not drawn(page, *arrows[1])
+        for side, x, y in ((1, "right", "down"), (-1, "left", "up")):
+            shows[0] = replace(idle, next_tap=NextTap(2.35 * side, 2.35 * side, 0.0))
+            next_tap.to_have_text(f"2.4\u202fmm {x}, 2.4\u202fmm {y}")
+            page.wait_for_function(DRAWN, arg=arrows[side])
+            assert not drawn(page, *arrows[-side])
         shows[0] = contact
         state.to_have_text("contact")
         next_tap.to_have_text("\u2013")
-        assert not drawn(page, *mirrored)
+        assert not drawn(page, *arrows[-1])
 
 
 def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page):
