@@ -15,7 +15,6 @@ from edge_samples import wait_for
 from view_samples import HANDSHAKE, TIMEOUT_S, frame, get, live_page, page, refused_with
 from websockets.exceptions import ConnectionClosed
 
-from edge.cli.main import main
 from edge.pipeline.result_stream import uncollected
 from edge.view import frames, server
 from edge.view.server import SCRIPTS, TIDY_CONNECTIONS, Connection, load_page
@@ -98,16 +97,6 @@ def test_who_asks_too_much_or_too_long_harms_nobody():
             assert frame(other, "result")
             run.close()
         assert page.asked.refused < 250  # heard at a person's pace, and what waits is not read to its end
-
-
-def test_a_port_in_use_is_one_line_and_5(capsys):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        assert main(["--source", "slcan:/dev/no-such-port", "--view", str(port)]) == 5
-    assert capsys.readouterr().err == (
-        f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: Address already in use; "
-        "name another port with --view, 0 for any free one, or an address of this machine with --view-host\n"
-    )
 
 
 GOODBYE = b"\x88\x80\x00\x00\x00\x00"
