@@ -206,7 +206,9 @@ def test_each_kind_of_result_is_told(sink):
         known = {None: -1, False: 0, True: 1}[result.trusted]
         assert data[:2] == [known, result.state] or (result.state == "dropped" and data == [])
         frame = result.scan.sensor if result.source == "device" else f"{result.source}/{result.scan.sensor}"
-        assert {one["header"]["frame_id"] for one in published if "encoding" in one} == {frame}
+        images = [one for one in published if "encoding" in one]
+        assert {one["header"]["frame_id"] for one in images} == {frame}
+        assert (np.isnan(pixels(images[0]).reshape(3, 4, 4)) == ~result.scan.fresh).all(), "no reading is no number"
     sink.write(contact(0), {})
     published.clear()
     sink.write(without_pattern(contact(1), state="baseline_in_doubt", contact=None), {})

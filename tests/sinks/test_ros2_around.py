@@ -190,11 +190,6 @@ def test_types_are_called_described_and_hashed_as_ros_does(kind):
         assert TYPE_HASHES[kind.name] == ros2_messages.ROS.hash_rihs01(kind.name).removeprefix("RIHS01_")
 
 
-def test_a_taxel_that_gave_no_reading_is_not_a_number_of_counts():
-    values = map_messages.taxels(make_scan(absent=(6,))).reshape(3, 16)
-    assert np.isnan(values[:, 6]).all() and np.isnan(values).sum() == 3
-
-
 UNIX_NS = 1_700_000_000_123_456_789
 
 

@@ -87,22 +87,15 @@ def heard(value):
 
 
 def main(domain, topics, best_effort):
-    participant = DomainParticipant(domain)
+    participant, readers = DomainParticipant(domain), {}
     reliability = Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(0)
-
-    def qos(topic):
-        """As rclpy and rmw_cyclonedds ask for: volatile but for static frames, keep last, and plain CDR alone."""
-        return Qos(
-            reliability,
-            Policy.Durability.TransientLocal if topic == "tf_static" else Policy.Durability.Volatile,
-            Policy.History.KeepLast(5 if best_effort else 10),
-            Policy.DataRepresentation(use_cdrv0_representation=True),
-        )
-
-    readers = {
-        topic: DataReader(participant, Topic(participant, f"rt/{topic}", dds_type(name)), qos(topic))
-        for topic, name in topics.items()
-    }
+    # As rclpy and rmw_cyclonedds ask for: volatile but for static frames, keep last, and plain CDR alone.
+    history = Policy.History.KeepLast(5 if best_effort else 10)
+    cdr = Policy.DataRepresentation(use_cdrv0_representation=True)
+    for topic, name in topics.items():
+        durability = Policy.Durability.TransientLocal if topic == "tf_static" else Policy.Durability.Volatile
+        about = Topic(participant, f"rt/{topic}", dds_type(name))
+        readers[topic] = DataReader(participant, about, Qos(reliability, durability, history, cdr))
     print(json.dumps({"topic": "listening"}), flush=True)
     while True:
         for topic, reader in readers.items():
