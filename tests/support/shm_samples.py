@@ -85,5 +85,5 @@ def sink(name):
 def writer(name):
     """A process that writes the memory without end."""
     with ended(subprocess.Popen([sys.executable, "-c", WRITE, name], cwd=ROOT, stdout=subprocess.PIPE)) as writer:
-        assert writer.stdout.readline() == b"writes\n"
+        assert writer.stdout is not None and writer.stdout.readline() == b"writes\n"
         yield writer
