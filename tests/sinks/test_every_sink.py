@@ -21,7 +21,7 @@ from sink_samples import (
     make_sure_results,
 )
 
-from edge.api import Fan, LinkLostError, PadPose, Sink, SinkClosedError, SinkError, TimedPose, UsageError
+from edge.api import Fan, LinkLostError, PadPose, Sink, SinkError, TimedPose, UsageError
 from edge.sinks.json_records import COUNTED_NS
 from edge.sinks.registry import FORMS, check_sink, open_sink
 
@@ -122,13 +122,6 @@ def test_a_failing_sink_is_reported_and_the_others_go_on(bad, tmp_path):
     assert event.kind == "sink" and event.text.endswith("; the other sinks continue") and good.events == events
 
 
-def test_the_last_sinks_failure_or_its_readers_end_ends_the_run(tmp_path):
-    for bad, kind in ((full(tmp_path), SinkError), (gone(tmp_path), SinkClosedError)):
-        with pytest.raises(SinkError) as ended:
-            fan_of(bad).write(every_kind()[0], RUN)
-        assert type(ended.value) is kind
-
-
 @pytest.mark.parametrize(
     ("text", "error", "words"),
     [
@@ -147,6 +140,7 @@ def test_the_last_sinks_failure_or_its_readers_end_ends_the_run(tmp_path):
         ("zenoh:a?listen=x", UsageError, "'listen=x' after its key: expected zenoh:KEY, zenoh:KEY?connect="),
         ("zenoh:a?connect=here", UsageError, "'connect=here' after its key"),
         ("zenoh:a?", UsageError, "'' after its key"),
+        *((f"rerun:{target}", UsageError, "rerun:view") for target in ("press.mcap", "127.0.0.1", "")),
         *(
             (text, UsageError, ", ".join(one.text for one in FORMS.values()))
             for text in ("", "jsonl", "jsonl:", "npz:", "csv:a", "status:x", "x")

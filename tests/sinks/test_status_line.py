@@ -15,25 +15,24 @@ from edge.api import Event, Note, Runtime
 from edge.sinks.status_line import MessageSink, StatusSink
 
 
-@pytest.mark.parametrize(("stream", "start"), [(io.StringIO(), ""), (Terminal(), "\r\x1b[K")])
-def test_events_are_lines_that_cannot_control_the_terminal(stream, start):
-    messages = MessageSink(stream)
+@pytest.mark.parametrize(
+    ("kind", "term", "start"),
+    [(io.StringIO, "xterm", ""), (Terminal, "dumb", ""), (Terminal, "xterm", "\r\x1b[K")],
+)
+def test_events_are_lines_that_cannot_control_the_terminal(kind, term, start, monkeypatch):
+    """One that knows no escape sequences gets none."""
+    monkeypatch.setenv("TERM", term)
+    said, shown = kind(), kind()
+    messages, status = MessageSink(said), StatusSink(shown)
     messages.tell(Event(0, "trouble", None, "\x1b[2J\x9b\rpad\n\ud800 in µm"), {})
     told = tuple(Event(1, "refused", None, text) for text in ("zeroing refused", "zeroed; again"))
-    messages.write(replace(make_results(1)[0], events=told), RUN)
+    for sink in (messages, status):
+        sink.write(replace(make_results(1)[0], events=told), RUN)
+        sink.wait()
+        sink.close()
     lines = ("\\x1b[2J\\x9b\\rpad\\n\\ud800 in µm", "zeroing refused", "zeroed; again")
-    assert stream.getvalue() == "".join(f"{start}edge-sr: {line}\n" for line in lines)
-
-
-@pytest.mark.parametrize(("stream", "term"), [(Terminal(), "dumb"), (io.StringIO(), "xterm")])
-def test_what_knows_no_escape_sequences_gets_none(monkeypatch, stream, term):
-    monkeypatch.setenv("TERM", term)
-    status, messages = StatusSink(stream), MessageSink(stream)
-    status.write(make_results(1)[0], RUN)
-    messages.tell(Event(0, "trouble", None, "the cable is out"), {})
-    status.wait()
-    status.close()
-    assert stream.getvalue() == "edge-sr: the cable is out\n"
+    assert said.getvalue() == "".join(f"{start}edge-sr: {line}\n" for line in lines)
+    assert bool(shown.getvalue()) == bool(start)
 
 
 def test_the_hint_comes_ever_more_seldom_until_the_first_scan():

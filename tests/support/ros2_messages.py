@@ -12,11 +12,9 @@ import sys
 import time
 from functools import cache
 
-import numpy as np
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.idl import make_idl_struct
+from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.idl.annotations import final
-from cyclonedds.idl.types import array, byte, float32, float64, int8, int32, sequence, uint8, uint32
 from cyclonedds.internal import InvalidSample
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
@@ -34,18 +32,8 @@ FOXGLOVE = {  # as https://docs.ros.org/en/api/foxglove_msgs/html/msg/Grid.html 
 }
 for _name, _text in FOXGLOVE.items():
     ROS.register(get_types_from_msg(_text, f"foxglove_msgs/msg/{_name}"))
-IDL = {
-    "int8": int8,
-    "int32": int32,
-    "uint32": uint32,
-    "uint8": uint8,
-    "octet": byte,
-    "byte": byte,
-    "bool": bool,
-    "float32": float32,
-    "float64": float64,
-    "string": str,
-}
+IDL = {kind: getattr(types, kind) for kind in ("int8", "int32", "uint32", "uint8", "byte", "float32", "float64")}
+IDL |= {"octet": types.byte, "bool": bool, "string": str}
 
 
 def fields(name):
@@ -68,7 +56,7 @@ def dds_type(name):
     members = {}
     for field, kind, many in fields(name):
         single = IDL[kind] if kind in IDL else dds_type(kind)
-        members[field] = sequence[single] if many is True else array[single, many] if many else single
+        members[field] = types.sequence[single] if many is True else types.array[single, many] if many else single
     return final(make_idl_struct(message, f"{package}.msg.dds_.{message}_", members))
 
 
@@ -83,28 +71,14 @@ def built(name, message):
     return dds_type(name)(**values)
 
 
-def type_hash(name):
-    """Return the hash RIHS01 of a type."""
-    return ROS.hash_rihs01(name).removeprefix("RIHS01_")
-
-
 def decode(name, data):
-    """Decode a message from plain little-endian CDR, by ROS's definitions alone; all of `data` is used."""
+    """Decode a message from plain little-endian CDR, by ROS's definitions alone."""
     assert data[:4] == b"\x00\x01\x00\x00"
-    return plain(ROS.deserialize_cdr(data, name))
-
-
-def plain(value):
-    """Return a message as nested dicts and lists."""
-    if hasattr(value, "__msgtype__"):
-        return {key: plain(one) for key, one in vars(value).items() if key != "__msgtype__"}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return [plain(one) for one in value] if isinstance(value, list) else value
+    return heard(dds_type(name).deserialize(data))
 
 
 def heard(value):
-    """Return a received message as nested dicts and lists, bytes in hexadecimal."""
+    """Return a message as nested dicts and lists, bytes in hexadecimal."""
     if dataclasses.is_dataclass(value):
         return {field.name: heard(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, list) and value and isinstance(value[0], int):
@@ -113,22 +87,15 @@ def heard(value):
 
 
 def main(domain, topics, best_effort):
-    participant = DomainParticipant(domain)
+    participant, readers = DomainParticipant(domain), {}
     reliability = Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(0)
-
-    def qos(topic):
-        """As rclpy and rmw_cyclonedds ask for: volatile but for static frames, keep last, and plain CDR alone."""
-        return Qos(
-            reliability,
-            Policy.Durability.TransientLocal if topic == "tf_static" else Policy.Durability.Volatile,
-            Policy.History.KeepLast(5 if best_effort else 10),
-            Policy.DataRepresentation(use_cdrv0_representation=True),
-        )
-
-    readers = {
-        topic: DataReader(participant, Topic(participant, f"rt/{topic}", dds_type(name)), qos(topic))
-        for topic, name in topics.items()
-    }
+    # As rclpy and rmw_cyclonedds ask for: volatile but for static frames, keep last, and plain CDR alone.
+    history = Policy.History.KeepLast(5 if best_effort else 10)
+    cdr = Policy.DataRepresentation(use_cdrv0_representation=True)
+    for topic, name in topics.items():
+        durability = Policy.Durability.TransientLocal if topic == "tf_static" else Policy.Durability.Volatile
+        about = Topic(participant, f"rt/{topic}", dds_type(name))
+        readers[topic] = DataReader(participant, about, Qos(reliability, durability, history, cdr))
     print(json.dumps({"topic": "listening"}), flush=True)
     while True:
         for topic, reader in readers.items():
@@ -141,5 +108,5 @@ def main(domain, topics, best_effort):
 
 if __name__ == "__main__":
     if "signed-bytes" in sys.argv:
-        IDL["uint8"] = int8
+        IDL["uint8"] = types.int8
     main(int(sys.argv[1]), json.loads(sys.argv[2]), "best-effort" in sys.argv)

@@ -2,11 +2,11 @@
 
 import json
 import os
-import queue
 import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ import ros2_messages
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.topic import Topic
-from edge_samples import ROOT, fake_source, make_contract, make_scan
+from edge_samples import ROOT, fake_source, make_contract, make_scan, wait_for
 
 from edge.perception.result import Result
 from edge.sinks.ros2 import dds_domain as ros2_domain
@@ -40,7 +40,6 @@ LISTENERS_CONFIGURATION = (
     '<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex><Peers><Peer address="localhost"/></Peers></Discovery>'
     f"</Domain></CycloneDDS>,{TAG}"
 )
-PATIENCE_S = 20
 CDR = Qos(Policy.Reliability.Reliable(0), Policy.DataRepresentation(use_cdrv0_representation=True))
 
 
@@ -57,8 +56,9 @@ def without_pattern(result, **changes):
     return replace(result, scan=scan, pattern=None, deviation=None, **changes)
 
 
-def keep_published(sink, kept, *names):
-    """Keep the messages of a sink, or those of some types, as decoded by the rules, in place of publishing them."""
+def keep_published(sink, *names):
+    """Return the messages of a sink, or those of some types, decoded by the rules in place of being published."""
+    kept = []
 
     def keep(writer, data):
         package, _, kind = writer.data_type.__idl_typename__.split(".", 2)
@@ -67,6 +67,7 @@ def keep_published(sink, kept, *names):
             kept.append(ros2_messages.decode(name, data))
 
     sink.publish, sink.is_read = keep, lambda writer: True
+    return kept
 
 
 class Listener:
@@ -75,64 +76,47 @@ class Listener:
     def __init__(self, topics, *words, more=""):
         environment = os.environ | {"CYCLONEDDS_URI": LISTENERS_CONFIGURATION + more}
         command = [sys.executable, str(ROOT / "tests/support/ros2_messages.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
-        self.process = subprocess.Popen(
-            [*command, json.dumps(topics), *words], env=environment, stdout=subprocess.PIPE, text=True
-        )
+        command += [json.dumps(topics), *words]
+        self.process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
         self.heard = []
-        self._lines = queue.SimpleQueue()
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self):
         for line in self.process.stdout or ():
-            self._lines.put(json.loads(line))
+            self.heard.append(json.loads(line))
 
     def of(self, topic):
-        self._keep()
         return [line["message"] for line in self.heard if line["topic"] == topic]
-
-    def _keep(self):
-        while not self._lines.empty():
-            self.heard.append(self._lines.get())
 
     def until(self, satisfied, act=lambda: None):
         """Go on acting until the messages that were received suffice."""
-        end_s = time.monotonic() + PATIENCE_S
-        while not satisfied():
-            assert time.monotonic() < end_s, f"heard only {[line['topic'] for line in self.heard]}"
+
+        def enough():
             assert self.process.poll() is None
-            act()
-            time.sleep(0.01)
+            return satisfied() or act()
+
+        wait_for(enough)
 
     def __enter__(self):
-        self.until(lambda: self._keep() or self.heard)
+        self.until(lambda: self.heard)
         return self
 
     def __exit__(self, *exc_info):
-        self.process.kill()
-        self.process.wait()
-        if self.process.stdout is not None:
-            self.process.stdout.close()
+        with self.process:
+            self.process.kill()
 
 
-class Speaker:
-    """A node that publishes on topics, given by their names and types, with types made of ROS's definitions."""
-
-    def __init__(self, *topics):
-        self._domain, self._participant = ros2_domain.join(ENVIRONMENT)
-        self._writers = {}
-        for topic, name in topics:
-            kind: Any = ros2_messages.dds_type(name)
-            writer = DataWriter(self._participant, Topic(self._participant, f"rt/{topic}", kind), CDR)
-            self._writers[topic, name] = writer
-
-    def say(self, topic, name, message):
-        self._writers[topic, name].write(ros2_messages.built(name, message))
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc_info):
-        del self._writers, self._participant, self._domain
+@contextmanager
+def speaker(*topics):
+    """Yield a function that publishes on topics, given by name and type, with types made of ROS's definitions."""
+    domain, participant = ros2_domain.join(ENVIRONMENT)
+    writers = {}
+    for topic, name in topics:
+        kind: Any = ros2_messages.dds_type(name)
+        writers[topic, name] = DataWriter(participant, Topic(participant, f"rt/{topic}", kind), CDR)
+    yield lambda topic, name, message: writers[topic, name].write(ros2_messages.built(name, message))
+    writers.clear()
+    del participant, domain
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, ROOT, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, ROOT, FakeModel, ended, make_contract, make_scan
 
 from edge.perception.runtime import Runtime
 from edge.sinks.shm import HEARTBEAT_AT, MEMBERS, Layout, SharedMemorySink, struct_of
@@ -82,18 +82,8 @@ def sink(name):
 
 
 @pytest.fixture
-def start_writer(name):
-    writers = []
-
-    def start():
-        command = [sys.executable, "-c", WRITE, name]
-        writer = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
-        writers.append(writer)
+def writer(name):
+    """A process that writes the memory without end."""
+    with ended(subprocess.Popen([sys.executable, "-c", WRITE, name], cwd=ROOT, stdout=subprocess.PIPE)) as writer:
         assert writer.stdout is not None and writer.stdout.readline() == b"writes\n"
-        return writer
-
-    yield start
-    for writer in writers:
-        writer.kill()
-        writer.wait()
-        writer.stdout.close()
+        yield writer

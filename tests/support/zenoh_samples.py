@@ -6,7 +6,8 @@ import socket
 import subprocess
 import sys
 import threading
-from contextlib import suppress
+from functools import partial
+from types import SimpleNamespace
 
 import pytest
 from edge_samples import BASELINE, FakeModel, make_pad_contract, make_scan
@@ -19,9 +20,7 @@ CONTRACT = make_pad_contract(interval_factor=1.6)
 # Prints each message as it comes: who came and went, or key, encoding, writer and payload; all from one thread.
 CONSUME = """
 import json, sys, time, zenoh
-config = zenoh.Config()
-config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
+from zenoh_samples import listening
 def tell(*words):
     print(json.dumps(words), flush=True)
 def take(sample):
@@ -30,7 +29,7 @@ def take(sample):
 def follow(token):
     tell("came" if token.kind == zenoh.SampleKind.PUT else "went", str(token.key_expr))
 here = lambda callback: zenoh.handlers.Callback(callback, indirect=False)
-with zenoh.open(config) as session:
+with listening(sys.argv[1]) as session:
     session.liveliness().declare_subscriber("grip/alive/*", here(follow), history=True)
     session.declare_subscriber("grip/**", here(take))
     tell("listens")
@@ -58,52 +57,22 @@ def listening(endpoint, *connect):
     return zenoh.open(config)
 
 
-class Consumer:
-    def __init__(self, endpoint):
-        self.process = subprocess.Popen([sys.executable, "-c", CONSUME, endpoint], stdout=subprocess.PIPE)
-        self.lines = queue.SimpleQueue()
-        self.reader = threading.Thread(target=self.read)  # at once: a full pipe would hold up the consumer
-        self.reader.start()
-        assert self.next() == ["listens"]
-
-    def read(self):
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.lines.put(line)
-
-    def next(self):
-        return json.loads(self.lines.get(timeout=60))
-
-    def until_gone(self):
-        """Return the messages until the writer has gone, as key, encoding, writer, payload; and who came and went."""
-        told = [self.next()]
-        while told[-1][0] != "went":
-            told.append(self.next())
-        with suppress(queue.Empty):  # that it goes may overtake what it sent
-            while True:
-                told.append(json.loads(self.lines.get(timeout=0.6)))
-        messages = [(*words[1:-1], bytes.fromhex(words[-1])) for words in told if words[0] == "got"]
-        return messages, [words for words in told if words[0] != "got"]
-
-    def stop(self):
-        self.process.kill()
-        self.process.wait()
-        self.reader.join()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
-
 @pytest.fixture
-def consume():
-    consumers = []
+def consumer(endpoint):
+    """A consumer's process, and `next`, which returns the words of its next message."""
+    lines = queue.SimpleQueue()
+    with subprocess.Popen([sys.executable, "-c", CONSUME, endpoint], stdout=subprocess.PIPE) as process:
 
-    def start(endpoint):
-        consumers.append(Consumer(endpoint))
-        return consumers[-1]
+        def read():
+            for line in process.stdout or ():
+                lines.put(json.loads(line))
 
-    yield start
-    for consumer in consumers:
-        consumer.stop()
+        reader = threading.Thread(target=read)  # at once: a full pipe would hold up the consumer
+        reader.start()
+        assert lines.get(timeout=60) == ["listens"]
+        yield SimpleNamespace(process=process, next=partial(lines.get, timeout=60))
+        process.kill()
+        reader.join()
 
 
 def make_results(count):

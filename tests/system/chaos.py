@@ -9,7 +9,6 @@ counted. In runs of minutes memory and latency must stay flat as well. Exit code
 
 import argparse
 import math
-import os
 import re
 import signal
 import statistics
@@ -20,7 +19,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
@@ -34,7 +33,6 @@ from numpy.typing import NDArray
 from program_cost import CONTROLLERS, REST_COUNTS, ROOT, away_from_press, prefixes_of, resident_mb, started, typed
 
 from edge.pipeline.result_stream import uncollected
-from edge.sinks.json_records import PIPE_BYTES
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.pty_port import EmulatorThread
@@ -218,12 +216,16 @@ class Chaos:
 
     def play(self, seconds: float) -> list[str]:
         """Run for so long; return the promises that were not kept, of a run of minutes its growth as well."""
+        null = subprocess.DEVNULL
         with (
             tempfile.TemporaryDirectory() as name,
             uncollected(),  # or no thread would read for a tenth of a second
             EmulatorThread(buses := self._buses(Path(name))),
-            self._program(Path(name), buses) as process,
+            (Path(name) / "said").open("wb") as errors,
+            started(self._typed(Path(name), buses), ROOT, stdin=null, stdout=subprocess.PIPE, stderr=errors) as process,
+            ExitStack() as ending,
         ):
+            ending.callback(process.kill)
             lines = SimpleQueue[bytes]()
             reader = threading.Thread(target=_read, args=(process.stdout, lines), daemon=True)
             reader.start()
@@ -280,18 +282,9 @@ class Chaos:
             self.judge.back_ns[prefix] = buses[-1].back_ns
         return buses
 
-    @contextmanager
-    def _program(self, folder: Path, buses: Sequence[FaultyBus]) -> Iterator[subprocess.Popen[bytes]]:
-        command = typed(folder, self.names, self._scans, [bus.line.path for bus in buses])
-        command += ["--sink", "jsonl:-", "--fields", FIELDS]
-        with (
-            (folder / "said").open("wb") as said,
-            started(command, ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said) as process,
-        ):
-            try:
-                yield process
-            finally:
-                process.kill()
+    def _typed(self, folder: Path, buses: Sequence[FaultyBus]) -> list[str]:
+        words = typed(folder, self.names, self._scans, [bus.line.path for bus in buses])
+        return [*words, "--sink", "jsonl:-", "--fields", FIELDS]
 
     def _follow(self, lines: SimpleQueue[bytes], process: subprocess.Popen[bytes], seconds: float) -> None:
         """Judge records for so long from the first on, and measure memory and latency window by window."""
@@ -323,11 +316,9 @@ class Chaos:
 
 def _read(stream: IO[bytes], lines: SimpleQueue[bytes]) -> None:
     """Fetch records at once, since what finds no room is left out for a reader that is slow."""
-    rest = b""
-    while data := os.read(stream.fileno(), PIPE_BYTES):
-        *whole, rest = (rest + data).split(b"\n")
-        for one in whole:
-            lines.put(one)
+    for line in stream:
+        if line.endswith(b"\n"):  # else the program was killed in the middle of it
+            lines.put(line)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,6 +15,7 @@ its own, and a line is cut from its end and never down to a whole frame.
 import argparse
 import math
 import random
+import re
 import sys
 import time
 from collections import Counter
@@ -146,6 +147,10 @@ LINK_FAULTS: Final = (UNPLUG, RENAME, RESET)
 NAMES: Final = (*BUS_FAULTS, *LINE_FAULTS, BURSTS, *LINK_FAULTS)
 
 
+_NUMBER: Final = r"\d*\.?\d+"
+_FAULT: Final = re.compile(rf"(?P<name>[a-z-]+)(=(?P<share>{_NUMBER}))?@(?P<start>{_NUMBER})\+(?P<length>{_NUMBER})")
+
+
 class Stretch(NamedTuple):
     """Fault, the share that it strikes, and its interval in [s]."""
 
@@ -159,18 +164,13 @@ def stretches(text: str, seed: int) -> list[Stretch]:
     """Parse faults as a user writes them; raises ValueError where there is no such fault, share or time."""
     found: list[Stretch] = []
     for part in filter(None, text.split(",")):
-        what, _, when = part.partition("@")
-        name, _, share = what.partition("=")
-        start, _, length = when.partition("+")
-        if name not in (*NAMES, MIXED):
-            raise ValueError(f"fault is {name!r}, expected one of: {', '.join((*NAMES, MIXED))}")
-        try:
-            begin_s, long_s, struck = float(start), float(length), float(share or USUAL_SHARE.get(name, 0.02))
-        except ValueError:
-            raise ValueError(f"fault is {part!r}, expected NAME[=SHARE]@START+LENGTH in seconds") from None
-        found += (
-            _mixture(begin_s, long_s, seed) if name == MIXED else [Stretch(name, struck, begin_s, begin_s + long_s)]
-        )
+        read = _FAULT.fullmatch(part)
+        if read is None or read["name"] not in (*NAMES, MIXED):
+            names = ", ".join((*NAMES, MIXED))
+            raise ValueError(f"fault is {part!r}, expected NAME[=SHARE]@START+LENGTH in seconds, NAME one of: {names}")
+        name, start_s, long_s = read["name"], float(read["start"]), float(read["length"])
+        share = float(read["share"] or USUAL_SHARE.get(name, 0.02))
+        found += _mixture(start_s, long_s, seed) if name == MIXED else [Stretch(name, share, start_s, start_s + long_s)]
     return sorted(found, key=lambda one: one.start_s)
 
 

@@ -20,7 +20,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -134,20 +134,15 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
     sinks = ["--sink", "status"] if part == "at rest" else ["--sink", "jsonl:-", "--every-scan"]
     pipe, null = subprocess.PIPE, subprocess.DEVNULL
     with started([*command, *map(str, played)], ROOT, stdin=pipe, stdout=pipe) as emulators:
-        try:
-            ports = [emulators.stdout.readline().decode().strip() if emulators.stdout else "" for _ in range(buses)]
-            program = [*typed(folder, names, prefixes, ports), *sinks]
-            with (
-                uncollected(),  # or a pause of our own collector would count as the program's
-                started(program, tree, stdin=null, stderr=null, stdout=null if part == "at rest" else pipe) as process,
-            ):
-                try:
-                    yield process
-                finally:
-                    process.kill()  # its last records are of no interest
-        finally:
-            if emulators.stdin:
-                emulators.stdin.close()
+        ports = [emulators.stdout.readline().decode().strip() if emulators.stdout else "" for _ in range(buses)]
+        program = [*typed(folder, names, prefixes, ports), *sinks]
+        with (
+            uncollected(),  # or a pause of our own collector would count as the program's
+            started(program, tree, stdin=null, stderr=null, stdout=null if part == "at rest" else pipe) as process,
+            ExitStack() as ending,
+        ):
+            ending.callback(process.kill)  # its last records are of no interest
+            yield process
 
 
 def started(

@@ -13,7 +13,6 @@ import sys
 import time
 import venv
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -49,17 +48,6 @@ def fresh(tmp_path_factory, wheels):
 
 
 @pytest.fixture(scope="module")
-def demo(fresh, tmp_path_factory):
-    """The installed runtime's demo with its first tap, which plays while other tests run, and its records' file."""
-    records = tmp_path_factory.mktemp("demo") / "records.jsonl"
-    command = [str(fresh / "edge-sr"), "--source", "demo", "--sink", f"jsonl:{records}", "--duration-s", "6"]
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, text=True, env=without_checkout(), **pipes) as process:
-        yield process, records
-        process.kill()
-
-
-@pytest.fixture(scope="module")
 def both(fresh, wheels):
     """The same environment with the second wheel as well, without torch and the like: used by the last tests alone."""
     pip(fresh.parent, *INSTALL, "--no-deps", wheels[1])
@@ -72,15 +60,11 @@ def pip(environment, *words, **variables):
     return run([*command, *words], **variables)
 
 
-def without_checkout():
-    """The environment without PYTHONPATH: a checkout on it would lend what the wheel lacks."""
-    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-
-
 def ended(folder, *command, **environment):
-    """Run a command in a folder to its end, whatever that is."""
+    """Run a command in a folder to its end, without PYTHONPATH: a checkout on it would lend what the wheel lacks."""
+    variables = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | environment
     settings = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "timeout": 240}
-    return subprocess.run(list(map(str, command)), cwd=folder, env=without_checkout() | environment, **settings)
+    return subprocess.run(list(map(str, command)), cwd=folder, env=variables, **settings)
 
 
 def run(command, **environment):
@@ -89,7 +73,7 @@ def run(command, **environment):
     return done.stdout
 
 
-def test_it_holds_the_runtime_alone_with_types_for_a_checker(fresh, demo, tmp_path):
+def test_it_holds_the_runtime_alone_with_types_for_a_checker(fresh, tmp_path):
     installed = {package["name"].lower() for package in json.loads(pip(fresh.parent, "list", "--format", "json"))}
     assert "tactile-edge-sr" in installed and not NOT_IN_THE_RUNTIME & installed
     (packages,) = fresh.parent.glob("lib/python*/site-packages")
@@ -161,12 +145,11 @@ def test_both_wheels_together_are_the_packages_of_a_checkout(wheels):
     assert of_packages[0] | of_packages[1] >= set(kept.stdout.splitlines())
 
 
-def test_the_demo_runs_from_the_wheel(demo):
-    process, records = demo
-    out, err = process.communicate(timeout=240)
-    assert process.returncode == 0, err
-    assert "PSNR" in out
-    lines = [json.loads(line) for line in records.read_text().splitlines()]
+def test_the_demo_runs_from_the_wheel(fresh, tmp_path):
+    done = ended(tmp_path, fresh / "edge-sr", "--source", "demo", "--sink", "jsonl:records", "--duration-s", "6")
+    assert done.returncode == 0, done.stderr
+    assert "PSNR" in done.stdout
+    lines = [json.loads(line) for line in (tmp_path / "records").read_text().splitlines()]
     assert {line["source"] for line in lines} == {"emulated"}
     assert any(line["pattern"] for line in lines)
 
@@ -201,30 +184,25 @@ def typed() -> list[str]:
 def run_in(folder: Path, command: str, at_work: str | None = None) -> str:
     """Run a command until it ends, or until it is at work and Ctrl-C; return what it printed."""
     variables = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    shown = ""
     with subprocess.Popen(
-        ["bash", "-c", command], cwd=folder, env=variables, start_new_session=True, text=True, **pipes
+        ["bash", "-c", command], cwd=folder, env=variables, start_new_session=True, **pipes
     ) as process:
         try:
-            shown = "".join(_until(process.stdout, at_work))
-            if at_work is not None:
-                assert at_work in shown, f"{command} ended: {shown[-2000:]}"
-                time.sleep(3)
-                os.killpg(process.pid, signal.SIGINT)
-            rest, _ = process.communicate(timeout=LONGEST_S)
+            for line in process.stdout:
+                if at_work is not None and at_work in line and at_work not in shown:
+                    time.sleep(3)
+                    os.killpg(process.pid, signal.SIGINT)
+                shown += line
+            process.wait(60)
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
+    assert at_work is None or at_work in shown, f"{command} ended: {shown[-2000:]}"
     allowed = {0} if at_work is None else {0, 130, -signal.SIGINT}
-    assert process.returncode in allowed, f"{command}: {(shown + rest)[-2000:]}"
-    return shown + rest
-
-
-def _until(lines, at_work: str | None) -> Iterator[str]:
-    for line in lines if at_work is not None else ():
-        yield line
-        if at_work in line:
-            return
+    assert process.returncode in allowed, f"{command}: {shown[-2000:]}"
+    return shown
 
 
 @pytest.mark.night

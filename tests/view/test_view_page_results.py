@@ -5,6 +5,8 @@ import re
 import socket
 import threading
 from dataclasses import replace
+from email.policy import HTTP
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 
 import browser_samples as web
@@ -92,19 +94,17 @@ def test_the_pad_is_outlined_where_to_touch_next(open_page):
         shows[0] = idle
         state.to_have_text("idle")
         next_tap.to_have_text("\u2013")
-        arrow, mirrored = ([CENTRE + side * PITCH / 2] * 2 for side in (1, -1))  # the arrow begins at the centre
-        assert not drawn(page, *arrow)
-        shows[0] = replace(idle, next_tap=NextTap(2.35, 2.35, 0.0))
-        next_tap.to_have_text("2.4\u202fmm right, 2.4\u202fmm down")
-        page.wait_for_function(DRAWN, arg=arrow)
-        assert not drawn(page, *mirrored)
-        shows[0] = replace(idle, next_tap=NextTap(-2.35, -2.35, 0.0))
-        next_tap.to_contain_text("2.4\u202fmm left, 2.4\u202fmm up")
-        page.wait_for_function(DRAWN, arg=mirrored)
+        arrows = {side: [CENTRE + side * PITCH / 2] * 2 for side in (1, -1)}  # the arrow begins at the centre
+        assert not drawn(page, *arrows[1])
+        for side, x, y in ((1, "right", "down"), (-1, "left", "up")):
+            shows[0] = replace(idle, next_tap=NextTap(2.35 * side, 2.35 * side, 0.0))
+            next_tap.to_have_text(f"2.4\u202fmm {x}, 2.4\u202fmm {y}")
+            page.wait_for_function(DRAWN, arg=arrows[side])
+            assert not drawn(page, *arrows[-side])
         shows[0] = contact
         state.to_have_text("contact")
         next_tap.to_have_text("\u2013")
-        assert not drawn(page, *mirrored)
+        assert not drawn(page, *arrows[-1])
 
 
 def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page):
@@ -215,39 +215,28 @@ def pump(source, sink):
 
 
 @contextlib.contextmanager
-def proxy(port, *, below="/edge/", host=None, sockets=True):
+def proxy(port, *, host=None, sockets=True):
     """Serve the page at `port` below a path, with another Host as nginx sends it; yield the address."""
 
-    def serve(client):
-        head = b""
-        while b"\r\n\r\n" not in head:
-            if not (data := client.recv(65536)):
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            if not self.path.startswith("/edge/") or (sockets is None and "/ws" in self.path):
+                self.send_error(502)
                 return
-            head += data
-        method, path, rest = head.split(b" ", 2)
-        if not path.startswith(below.encode()) or (b"/ws" in path and sockets is None):
-            client.sendall(b"HTTP/1.1 502 Bad Gateway\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
-            client.close()
-            return
-        if host is not None:
-            named = b"\r\nHost: " + host.format(port=port).encode()
-            rest = re.sub(rb"\r\nHost: [^\r]*", named, rest, flags=re.IGNORECASE)
-        if not sockets:
-            rest = re.sub(rb"\r\n(Upgrade|Connection): [^\r]*", b"", rest, flags=re.IGNORECASE)
-        upstream = socket.create_connection(("127.0.0.1", port))
-        upstream.sendall(b" ".join((method, path[len(below) - 1 :], rest)))
-        threading.Thread(target=pump, args=(upstream, client), daemon=True).start()
-        pump(client, upstream)
+            if host is not None:
+                self.headers.replace_header("Host", host.format(port=port))
+            for name in () if sockets else ("Upgrade", "Connection"):
+                del self.headers[name]
+            upstream = socket.create_connection(("127.0.0.1", port))
+            upstream.sendall(f"GET {self.path.removeprefix('/edge')} HTTP/1.1\r\n".encode())
+            upstream.sendall(self.headers.as_bytes(policy=HTTP))
+            threading.Thread(target=pump, args=(upstream, self.connection), daemon=True).start()
+            pump(self.connection, upstream)
 
-    def accept():
-        with contextlib.suppress(OSError):
-            while True:
-                threading.Thread(target=serve, args=(listener.accept()[0],), daemon=True).start()
-
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        threading.Thread(target=accept, daemon=True).start()
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}{below}"
-        listener.shutdown(socket.SHUT_RDWR)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/edge/"
+        server.shutdown()
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,10 @@ from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
-from bridge_samples import make_counts, write_recording
 from edge_samples import wait_for
 from view_samples import HANDSHAKE, TIMEOUT_S, frame, get, live_page, page, refused_with
 from websockets.exceptions import ConnectionClosed
 
-from edge.cli.main import main
 from edge.pipeline.result_stream import uncollected
 from edge.view import frames, server
 from edge.view.server import SCRIPTS, TIDY_CONNECTIONS, Connection, load_page
@@ -99,23 +97,6 @@ def test_who_asks_too_much_or_too_long_harms_nobody():
             assert frame(other, "result")
             run.close()
         assert page.asked.refused < 250  # heard at a person's pace, and what waits is not read to its end
-
-
-def test_a_port_in_use_is_one_line_and_5(capsys):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        assert main(["--source", "slcan:/dev/no-such-port", "--view", str(port)]) == 5
-    assert capsys.readouterr().err == (
-        f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: Address already in use; "
-        "name another port with --view, 0 for any free one, or an address of this machine with --view-host\n"
-    )
-
-
-def test_a_recording_with_a_page_is_played_as_if_live(tmp_path):
-    path = write_recording(tmp_path / "press.csv", make_counts(20), rate_hz=1000)
-    records, begun_ns = tmp_path / "out.jsonl", time.monotonic_ns()
-    assert main(["replay", str(path), "--sink", f"jsonl:{records}", "--view", "0"]) == 0
-    assert json.loads(records.read_text().splitlines()[0])["time_ns"] >= begun_ns
 
 
 GOODBYE = b"\x88\x80\x00\x00\x00\x00"
