@@ -180,22 +180,19 @@ class TestPoses:
     @pytest.mark.parametrize(
         ("taps", "poses", "match"),
         [
-            (8, (8, 5), r"window is \(8, 3, 4, 4\) float32, expected \(1 to 7, 3, 4, 4\) float32"),
-            (0, (0, 5), r"window is \(0, 3, 4, 4\)"),
-            (2, (3, 5), r"poses are \(3, 5\) float32, expected \(2, 5\) float32: dx_mm, .* of each tap"),
+            (8, np.zeros((8, 5)), r"window is \(8, 3, 4, 4\) float32, expected \(1 to 7, 3, 4, 4\) float32"),
+            (0, np.zeros((0, 5)), r"window is \(0, 3, 4, 4\)"),
+            (2, np.zeros((3, 5)), r"poses are \(3, 5\) float32, expected \(2, 5\) float32: dx_mm, .* of each tap"),
+            (2, np.ones((2, 5)), r"newest tap's pose is \[1.0, .*expected zeros: give poses as that tap"),
+            (2, np.array([[0] * 5, [np.nan] * 5]), "poses have values that are not finite"),
         ],
     )
-    def test_shapes_that_do_not_fit_are_refused_with_both(self, posed, taps, poses, match):
+    def test_windows_and_poses_that_mean_nothing_are_refused(self, posed, taps, poses, match):
         with pytest.raises(WindowError, match=match):
-            posed.run(np.zeros((taps, 3, 4, 4), dtype=np.float32), poses=np.zeros(poses, dtype=np.float32))
+            posed.run(np.zeros((taps, 3, 4, 4), np.float32), poses=poses.astype(np.float32))
 
-    def test_poses_that_mean_nothing_are_refused(self, posed, session):
-        window, poses = random_taps(2)
-        with pytest.raises(WindowError, match=r"newest tap's pose is \[1.0, .*expected zeros: give poses as that tap"):
-            posed.run(window, poses=poses + 1)
-        with pytest.raises(WindowError, match="poses have values that are not finite"):
-            posed.run(window, poses=np.where(poses == 0, poses, np.float32(np.nan)))
+    def test_poses_of_another_type_or_for_another_model_are_refused(self, posed, session):
         with pytest.raises(WindowError, match=r"poses are \(2, 5\) float64"):
-            posed.run(window, poses=poses.astype(float))
+            posed.run(np.zeros((2, 3, 4, 4), np.float32), poses=np.zeros((2, 5)))
         with pytest.raises(WindowError, match="poses are given, but model 'tiny' takes none: leave them out"):
             session.run(np.zeros((4, 3, 4, 4), np.float32), poses=np.zeros((4, 5), np.float32))
