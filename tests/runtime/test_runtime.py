@@ -24,15 +24,6 @@ class TestResult:
         assert result.note == "not checked: the model has no checks"
         assert result.deviation is result.interval_mm is None
 
-    def test_a_window_is_the_newest_scan_then_peaks_newest_first(self):
-        model = FakeModel()
-        pad = Pushed(make_runtime(model))
-        for press, made_of in ((8000, [8, 0, 0, 0]), (6000, [6, 8, 0, 0]), (4000, [4, 6, 8, 0])):
-            pad.tap(press=press)
-            assert model.windows[-1][:, 2, 1, 1].tolist() == made_of
-        pad.push(3000)
-        assert model.windows[-1][:, 2, 1, 1].tolist() == [3, 4, 6, 8]
-
     def test_where_nothing_is_touched_no_interval_is_told(self):
         contract = dataclasses.replace(SURE, counts_per_unit=(500.0, 500.0, -1000.0))
         result = Pushed(make_runtime(FakeModel(contract))).push(PRESS)
