@@ -2,11 +2,8 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
 from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.api import Baseline, UsageError, WindowError
@@ -50,9 +47,6 @@ class TestRefusals:
         assert "no stored baseline for sensor 4, only for left/4" in result.note
 
 
-ABSENT = st.lists(st.integers(0, 15), max_size=16, unique=True)
-
-
 class TestOvertaken:
     def test_a_scan_overtaken_spares_the_inference_but_feeds_the_tap(self):
         model = FakeModel()
@@ -65,20 +59,6 @@ class TestOvertaken:
         runtime.push(make_scan(2))
         runtime.push(make_scan(3, press_counts=2000))
         assert model.windows[-1][1, 2, 1, 1] == 9.0, "the peak was in the scan without a pattern"
-
-    @settings(max_examples=30, deadline=None)
-    @given(st.lists(st.tuples(st.sampled_from("46"), st.integers(0, 20_000), ABSENT, st.booleans()), max_size=40))
-    def test_any_scans_give_one_result_each(self, scans):
-        model = FakeModel()
-        runtime = make_runtime(model)
-        for number, (sensor, press, absent, infer) in enumerate(scans):
-            scan = make_scan(number, sensor=sensor, press_counts=press, absent=tuple(absent))
-            result = runtime.push(scan, infer=infer)
-            assert result.scan is scan
-            assert (result.pattern is not None) == (result.state == "contact")
-            assert (result.contact is None) == (result.state in ("zeroing", "incomplete"))
-            assert (result.taps_used > 0) == (result.state in ("contact", "dropped"))
-        assert all(np.isfinite(window).all() for window in model.windows)
 
 
 class TestAway:
