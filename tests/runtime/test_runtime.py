@@ -6,7 +6,7 @@ import pytest
 from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan
 from runtime_samples import PRESS, Pushed, make_runtime
 
-from edge.api import Baseline, UsageError, WindowError
+from edge.api import WindowError
 from edge.perception.run_options import RuntimeOptions
 from firmware_bridge.scans.mounting import Mounting
 
@@ -30,10 +30,7 @@ class TestResult:
 
 
 class TestRefusals:
-    def test_a_baseline_or_scan_of_another_grid_is_refused(self):
-        small = Baseline.of("4", REST[:, :2], 0.0, 100, "file")
-        with pytest.raises(UsageError, match=r"sensor 4 has shape \(3, 2, 4\), expected \(3, 4, 4\)"):
-            make_runtime(baselines={"4": small})
+    def test_a_scan_of_another_grid_is_refused(self):
         with pytest.raises(WindowError, match=r"scan has shape \(3, 2, 4\), expected \(3, 4, 4\)"):
             make_runtime().push(dataclasses.replace(make_scan(), counts=REST[:, :2]))
 

@@ -105,16 +105,11 @@ def test_another_name_or_type_and_a_lack_of_a_contract_are_refused(tmp_path):
         ModelSession(path)
 
 
-def test_no_file_a_directory_and_what_is_no_onnx_are_refused(tmp_path):
+def test_no_file_and_a_directory_are_refused(tmp_path):
     with pytest.raises(ModelError, match=r"none.onnx: cannot be read: No such file"):
         ModelSession(tmp_path / "none.onnx")
     with pytest.raises(ModelError, match=r"cannot be read: Is a directory"):
         ModelSession(tmp_path)
-    path = write_model(tmp_path / "cut.onnx")
-    for content in (b"", b"not a model", bytes(range(256)) * 40, path.read_bytes()[:-100]):
-        path.write_bytes(content)
-        with pytest.raises(ModelError, match=r"cut.onnx: "):
-            ModelSession(path)
 
 
 def random_taps(taps, seed=0):
