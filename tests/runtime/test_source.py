@@ -222,13 +222,6 @@ class TestRecords:
             counted = [counters["scans"] for counters in sink.counters]
             assert counted == [1, 3, 3] if patient else all(counted[n] >= at for n, at in enumerate((1, 3, 3)))
 
-    def test_the_trouble_of_a_sink_is_told_at_the_end(self):
-        class Full(ListSink):
-            unwritten, trouble = 3, "the disk is full"
-
-        statistics = pumped(FakeLink([presses([0])]), Full(), ListSink())
-        assert statistics.unwritten == 3 and statistics.summary(source="s").endswith("sinks: the disk is full")
-
     @pytest.mark.parametrize("kind", ["lost", "silent", "back", "trouble"])
     def test_a_notice_reaches_runtime_and_sinks_in_its_place(self, kind):
         order, runtime = [], make_runtime()

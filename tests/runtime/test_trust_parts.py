@@ -1,4 +1,4 @@
-"""Checks of a contract: what its forward model and its small networks compute, and that no damaged one is taken."""
+"""Checks of a contract: what its forward model leaves unexplained, and that no damaged one is taken."""
 
 import math
 from itertools import pairwise
@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from edge_samples import write_model
 from trust_samples import CONSTANTS, make_forward, make_trust, make_trusted_contract
 
 from edge.api import Contract, ModelError
-from edge.inference.onnx_session import ModelSession
 from edge.inference.trust_model import (
     GRID,
     KPA,
@@ -22,8 +20,6 @@ from edge.inference.trust_model import (
 )
 
 GAIN_ERROR = 0.075
-
-
 DAMAGE = [
     ("tap", None),
     ("forward", "more", 1),
@@ -38,55 +34,33 @@ DAMAGE = [
 ]
 
 
-class TestTrust:
-    def test_it_comes_back_from_a_model_file(self, tmp_path):
-        made = make_trust()
-        again = ModelSession(write_model(tmp_path / "checks.onnx", make_trusted_contract())).contract.read_trust()
-        row = np.linspace(-1, 1, 104, dtype=np.float32)
-        assert again.tap.network(row[None]) == made.tap.network(row[None]) and again.tap.limit == made.tap.limit
-        assert again.contact.network(row[None, :54]) == made.contact.network(row[None, :54])
-        for name in ("operator", "noise", "model_error"):
-            assert np.array_equal(getattr(again.forward, name), getattr(made.forward, name))
-
-    @pytest.mark.parametrize("damage", DAMAGE)
-    def test_damage_is_told_in_a_line_that_names_the_key(self, damage):
-        *road, last, damaged = damage
-        contract = make_trusted_contract()
-        part: Any = contract.trust
-        for step in road:
-            part = part[step]
-        part[last] = damaged
-        with pytest.raises(ModelError, match="contract key 'trust' is damaged") as told:
-            Contract.from_metadata(contract.to_metadata())
-        assert "\n" not in str(told.value) and "export the model again" in str(told.value)
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damage_is_told_in_a_line_that_names_the_key(damage):
+    *road, last, damaged = damage
+    contract = make_trusted_contract()
+    part: Any = contract.trust
+    for step in road:
+        part = part[step]
+    part[last] = damaged
+    with pytest.raises(ModelError, match="contract key 'trust' is damaged") as told:
+        Contract.from_metadata(contract.to_metadata())
+    assert "\n" not in str(told.value) and "export the model again" in str(told.value)
 
 
-def layers(*widths, seed=0):
-    rng = np.random.default_rng(seed)
-    return [(rng.standard_normal((after, before)), rng.standard_normal(after)) for before, after in pairwise(widths)]
+def layers(*widths):
+    return [(np.ones((after, before)), np.ones(after)) for before, after in pairwise(widths)]
 
 
-class TestSmallNetwork:
-    def test_it_has_a_rectifier_between_layers_and_none_at_the_end(self):
-        (first, one), (second, two) = made = layers(5, 7, 1)
-        two -= 7
-        network = SmallNetwork(made)
-        rows = np.random.default_rng(1).standard_normal((20, 5)).astype(np.float32)
-        before = rows.copy()
-        by_hand = np.maximum(rows @ first.T + one, 0) @ second[0] + two[0]
-        assert network(rows) == pytest.approx(by_hand, abs=1e-4)
-        assert by_hand.min() < 0 < by_hand.max() and network.inputs == 5 and (rows == before).all()
-
-    def test_layers_that_are_none_are_refused(self):
-        for made, said in (([*layers(4, 3), *layers(4, 1)], "after 3 units"), (layers(4, 2), "2 outputs")):
-            with pytest.raises(ValueError, match=said):
-                SmallNetwork(made)
+def test_layers_that_are_none_are_refused():
+    for made, said in (([*layers(4, 3), *layers(4, 1)], "after 3 units"), (layers(4, 2), "2 outputs")):
+        with pytest.raises(ValueError, match=said):
+            SmallNetwork(made)
 
 
-def make_maps(seed=0, size=40):
+def make_maps():
     """Return a pattern in [mm] and a traction in [kPa], both even enough to be told apart by cells."""
-    rng = np.random.default_rng(seed)
-    pattern = np.kron(rng.uniform(0, 0.5, (8, 8)), np.ones((size // 8, size // 8))).astype(np.float32)
+    rng = np.random.default_rng(0)
+    pattern = np.kron(rng.uniform(0, 0.5, (8, 8)), np.ones((5, 5))).astype(np.float32)
     traction = np.kron(rng.normal(0, 20, (3, 4, 4)), np.ones((1, 2, 2))).astype(np.float32)
     return pattern, traction
 
