@@ -6,7 +6,7 @@ from scipy.ndimage import zoom
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from edge.errors import EdgeError
-from edge.evaluation.classical_methods import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
+from edge.evaluation.classical_methods import bicubic, bilinear, fitted_methods
 from edge.evaluation.metrics import boundary_distance_mm, contact_iou, psnr_db, rmse_percent, ssim, ssim_global
 from edge.inference.intervals import REGIONS, half_widths_mm, near_pixels, regions
 
@@ -105,13 +105,6 @@ def test_bicubic_is_exact_on_a_parabola():
     assert not np.allclose(up[5:55, 5:65], expected[5:55, 5:65])
     taxels = np.random.default_rng(4).standard_normal((3, 4, 4))
     assert np.allclose(bicubic(taxels, 5)[:, 2::5, 2::5], taxels), "it goes through the taxels"
-
-
-def test_fits_find_what_made_the_data():
-    rng = np.random.default_rng(1)
-    readings, matrix = rng.standard_normal((300, 6)), rng.standard_normal((6, 9))
-    assert np.allclose(fit_linear_map(readings, readings @ matrix, ridge=1e-12), matrix, atol=1e-5)
-    assert fit_gain(readings, 2.5 * readings) == pytest.approx(2.5)
 
 
 def test_methods_come_from_a_file_and_another_is_refused(tmp_path):
