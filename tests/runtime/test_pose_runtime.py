@@ -62,22 +62,16 @@ class TestChoice:
             result = pad.push(PRESS)
             assert result.pose.x_mm == x_mm and result.poses[:, 0].tolist() == [0, 1 - x_mm]
 
-    def test_the_pose_is_that_of_when_readings_were_on_the_bus(self):
+    def test_a_pose_is_that_of_when_readings_were_on_the_bus(self):
+        """Also that of an earlier tap; where the device states no time, of when they arrived."""
         pad = make_pad()
         for number in range(20):
             pad.runtime.pose(PadPose(number, 0), number * PERIOD_NS)
-        for device_ns, x_mm in ((None, 11), (10 * PERIOD_NS + PERIOD_NS // 2, 10.5)):
-            scan = replace(pad.scan(PRESS, time_ns=11 * PERIOD_NS), device_ns=device_ns)
-            assert pad.runtime.push(scan).pose.x_mm == x_mm
-
-    def test_an_earlier_tap_has_the_pose_of_when_it_was_on_the_bus(self):
-        pad = make_pad()
-        for number in range(20):
-            pad.runtime.pose(PadPose(number, 0), number * PERIOD_NS)
-        for time, on_bus, press in ((6, 5, PRESS), (10, 7, 2 * PRESS), (11, 10, 0), (13, 12, PRESS)):
-            scan = replace(pad.scan(press, time_ns=time * PERIOD_NS), device_ns=on_bus * PERIOD_NS)
-            result = pad.runtime.push(scan)
-        assert result.pose.x_mm == 12 and result.poses[:, 0].tolist() == [0, 7 - 12]
+        for at, on_bus, share in ((6, 5.5, 1), (10, 7, 2), (11, 10, 0), (13, 12.5, 1), (14, None, 1)):
+            device_ns = None if on_bus is None else round(on_bus * PERIOD_NS)
+            result = pad.runtime.push(replace(pad.scan(share * PRESS, time_ns=at * PERIOD_NS), device_ns=device_ns))
+            assert result.pose.x_mm == (at if on_bus is None else on_bus)
+        assert result.poses[:, 0].tolist() == [0, 7 - 14]
 
     def test_a_scan_without_a_pose_is_used_alone_with_one_event_each(self):
         pad = make_pad()

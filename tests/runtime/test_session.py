@@ -38,18 +38,6 @@ def test_runs_what_the_graph_says_newest_tap_first(tmp_path, taps):
     np.testing.assert_array_equal(session.run(np.asfortranarray(window)), kept)
 
 
-def test_windows_run_together_give_what_each_gives_alone(tmp_path):
-    session = ModelSession(write_model(tmp_path / "several.onnx", SURE))
-    windows = [random_window(seed) for seed in range(3)]
-    alone = [(session.run(window).copy(), session.deviation.copy()) for window in windows]
-    for count in (3, 1, 2):
-        together = session.run_together(windows[:count])
-        assert together.shape == session.deviation.shape == (count, 40, 40)
-        for index in range(count):
-            np.testing.assert_array_equal(together[index], alone[index][0])
-            np.testing.assert_array_equal(session.deviation[index], alone[index][1])
-
-
 def test_a_window_not_finite_or_of_another_shape_is_refused(session):
     window = random_window()
     window[3, 1, 2, 2] = np.inf
@@ -117,16 +105,11 @@ def test_another_name_or_type_and_a_lack_of_a_contract_are_refused(tmp_path):
         ModelSession(path)
 
 
-def test_no_file_a_directory_and_what_is_no_onnx_are_refused(tmp_path):
+def test_no_file_and_a_directory_are_refused(tmp_path):
     with pytest.raises(ModelError, match=r"none.onnx: cannot be read: No such file"):
         ModelSession(tmp_path / "none.onnx")
     with pytest.raises(ModelError, match=r"cannot be read: Is a directory"):
         ModelSession(tmp_path)
-    path = write_model(tmp_path / "cut.onnx")
-    for content in (b"", b"not a model", bytes(range(256)) * 40, path.read_bytes()[:-100]):
-        path.write_bytes(content)
-        with pytest.raises(ModelError, match=r"cut.onnx: "):
-            ModelSession(path)
 
 
 def random_taps(taps, seed=0):
@@ -180,22 +163,19 @@ class TestPoses:
     @pytest.mark.parametrize(
         ("taps", "poses", "match"),
         [
-            (8, (8, 5), r"window is \(8, 3, 4, 4\) float32, expected \(1 to 7, 3, 4, 4\) float32"),
-            (0, (0, 5), r"window is \(0, 3, 4, 4\)"),
-            (2, (3, 5), r"poses are \(3, 5\) float32, expected \(2, 5\) float32: dx_mm, .* of each tap"),
+            (8, np.zeros((8, 5)), r"window is \(8, 3, 4, 4\) float32, expected \(1 to 7, 3, 4, 4\) float32"),
+            (0, np.zeros((0, 5)), r"window is \(0, 3, 4, 4\)"),
+            (2, np.zeros((3, 5)), r"poses are \(3, 5\) float32, expected \(2, 5\) float32: dx_mm, .* of each tap"),
+            (2, np.ones((2, 5)), r"newest tap's pose is \[1.0, .*expected zeros: give poses as that tap"),
+            (2, np.array([[0] * 5, [np.nan] * 5]), "poses have values that are not finite"),
         ],
     )
-    def test_shapes_that_do_not_fit_are_refused_with_both(self, posed, taps, poses, match):
+    def test_windows_and_poses_that_mean_nothing_are_refused(self, posed, taps, poses, match):
         with pytest.raises(WindowError, match=match):
-            posed.run(np.zeros((taps, 3, 4, 4), dtype=np.float32), poses=np.zeros(poses, dtype=np.float32))
+            posed.run(np.zeros((taps, 3, 4, 4), np.float32), poses=poses.astype(np.float32))
 
-    def test_poses_that_mean_nothing_are_refused(self, posed, session):
-        window, poses = random_taps(2)
-        with pytest.raises(WindowError, match=r"newest tap's pose is \[1.0, .*expected zeros: give poses as that tap"):
-            posed.run(window, poses=poses + 1)
-        with pytest.raises(WindowError, match="poses have values that are not finite"):
-            posed.run(window, poses=np.where(poses == 0, poses, np.float32(np.nan)))
+    def test_poses_of_another_type_or_for_another_model_are_refused(self, posed, session):
         with pytest.raises(WindowError, match=r"poses are \(2, 5\) float64"):
-            posed.run(window, poses=poses.astype(float))
+            posed.run(np.zeros((2, 3, 4, 4), np.float32), poses=np.zeros((2, 5)))
         with pytest.raises(WindowError, match="poses are given, but model 'tiny' takes none: leave them out"):
             session.run(np.zeros((4, 3, 4, 4), np.float32), poses=np.zeros((4, 5), np.float32))

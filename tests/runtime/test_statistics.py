@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from edge_samples import BASELINE, ROOT, make_scan
-from runtime_samples import Pushed
 
-from edge.perception.event import KINDS, NOTE_KINDS, Event, Note, joined
+from edge.perception.event import KINDS, NOTE_KINDS, Event, Note
 from edge.perception.result import Result
 from edge.pipeline.run_statistics import Statistics
 
@@ -104,22 +103,3 @@ def test_the_page_goes_by_kinds_that_there_are():
     assert {"refused", "in_contact", "rest_level", "lost"} <= named <= KINDS
     notes = set(re.findall(r"\(kind\) => kind !== \"(\w+)\"", page))
     assert notes and notes <= NOTE_KINDS
-
-
-def test_a_result_has_once_what_happened_before_it():
-    pad = Pushed()
-    pad.runtime.zero()
-    first = pad.push()
-    assert [(event.kind, event.sensor) for event in first.events] == [("refused", None)]
-    assert first.event == "zeroing refused: no scan has arrived yet"
-    pad.runtime.reset()
-    pad.runtime.zero("9")
-    pad.runtime.zero("4")
-    pad.runtime.lose_touch()
-    result = pad.push()
-    told = [("reset", None), ("refused", None), ("given_up", "4")]
-    assert [(event.kind, event.sensor) for event in result.events] == told
-    assert {event.time_ns for event in result.events} == {result.scan.time_ns}
-    assert result.event == joined(result.events) == "; ".join(event.text for event in result.events)
-    after = pad.push()
-    assert after.events == () and after.event is None

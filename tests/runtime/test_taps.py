@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from edge.api import UsageError
 from edge.perception.run_options import RuntimeOptions
@@ -106,24 +104,3 @@ def test_settings_that_cannot_be_are_refused():
     for wrong in (*counts, {"idle_reset_s": 0}, {"idle_reset_s": float("nan")}):
         with pytest.raises(UsageError, match="expected"):
             RuntimeOptions(**wrong)
-
-
-events = st.one_of(
-    st.tuples(st.floats(-5000, 20000), st.integers(-(2**62), 2**62)),
-    st.tuples(st.sampled_from([749.0, 750.0, 1499.0, 1500.0, 3000.0]), st.integers(0, 20 * S)),
-    st.just("reset"),
-)
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.integers(1, 4), st.lists(events, max_size=60))
-def test_any_sequence_keeps_the_invariants(taps, sequence):
-    tracker, contact = make_tracker(taps), False
-    for event in sequence:
-        if event == "reset":
-            tracker.reset()
-            continue
-        contact = event[0] >= (750 if contact else 1500)
-        assert push(tracker, *event).contact == contact and len(tracker.peaks) < taps
-        numbers = [*[tracker.tap] * contact, *(peak.tap for peak in tracker.peaks)]
-        assert numbers == sorted(set(numbers), reverse=True)

@@ -1,4 +1,4 @@
-"""Checks of a contract: what its forward model and its small networks compute, and that no damaged one is taken."""
+"""Checks of a contract: what its forward model leaves unexplained, and that no damaged one is taken."""
 
 import math
 from itertools import pairwise
@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from edge_samples import write_model
 from trust_samples import CONSTANTS, make_forward, make_trust, make_trusted_contract
 
 from edge.api import Contract, ModelError
-from edge.inference.onnx_session import ModelSession
 from edge.inference.trust_model import (
     GRID,
     KPA,
@@ -22,8 +20,6 @@ from edge.inference.trust_model import (
 )
 
 GAIN_ERROR = 0.075
-
-
 DAMAGE = [
     ("tap", None),
     ("forward", "more", 1),
@@ -38,55 +34,33 @@ DAMAGE = [
 ]
 
 
-class TestTrust:
-    def test_it_comes_back_from_a_model_file(self, tmp_path):
-        made = make_trust()
-        again = ModelSession(write_model(tmp_path / "checks.onnx", make_trusted_contract())).contract.read_trust()
-        row = np.linspace(-1, 1, 104, dtype=np.float32)
-        assert again.tap.network(row[None]) == made.tap.network(row[None]) and again.tap.limit == made.tap.limit
-        assert again.contact.network(row[None, :54]) == made.contact.network(row[None, :54])
-        for name in ("operator", "noise", "model_error"):
-            assert np.array_equal(getattr(again.forward, name), getattr(made.forward, name))
-
-    @pytest.mark.parametrize("damage", DAMAGE)
-    def test_damage_is_told_in_a_line_that_names_the_key(self, damage):
-        *road, last, damaged = damage
-        contract = make_trusted_contract()
-        part: Any = contract.trust
-        for step in road:
-            part = part[step]
-        part[last] = damaged
-        with pytest.raises(ModelError, match="contract key 'trust' is damaged") as told:
-            Contract.from_metadata(contract.to_metadata())
-        assert "\n" not in str(told.value) and "export the model again" in str(told.value)
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damage_is_told_in_a_line_that_names_the_key(damage):
+    *road, last, damaged = damage
+    contract = make_trusted_contract()
+    part: Any = contract.trust
+    for step in road:
+        part = part[step]
+    part[last] = damaged
+    with pytest.raises(ModelError, match="contract key 'trust' is damaged") as told:
+        Contract.from_metadata(contract.to_metadata())
+    assert "\n" not in str(told.value) and "export the model again" in str(told.value)
 
 
-def layers(*widths, seed=0):
-    rng = np.random.default_rng(seed)
-    return [(rng.standard_normal((after, before)), rng.standard_normal(after)) for before, after in pairwise(widths)]
+def layers(*widths):
+    return [(np.ones((after, before)), np.ones(after)) for before, after in pairwise(widths)]
 
 
-class TestSmallNetwork:
-    def test_it_has_a_rectifier_between_layers_and_none_at_the_end(self):
-        (first, one), (second, two) = made = layers(5, 7, 1)
-        two -= 7
-        network = SmallNetwork(made)
-        rows = np.random.default_rng(1).standard_normal((20, 5)).astype(np.float32)
-        before = rows.copy()
-        by_hand = np.maximum(rows @ first.T + one, 0) @ second[0] + two[0]
-        assert network(rows) == pytest.approx(by_hand, abs=1e-4)
-        assert by_hand.min() < 0 < by_hand.max() and network.inputs == 5 and (rows == before).all()
-
-    def test_layers_that_are_none_are_refused(self):
-        for made, said in (([*layers(4, 3), *layers(4, 1)], "after 3 units"), (layers(4, 2), "2 outputs")):
-            with pytest.raises(ValueError, match=said):
-                SmallNetwork(made)
+def test_layers_that_are_none_are_refused():
+    for made, said in (([*layers(4, 3), *layers(4, 1)], "after 3 units"), (layers(4, 2), "2 outputs")):
+        with pytest.raises(ValueError, match=said):
+            SmallNetwork(made)
 
 
-def make_maps(seed=0, size=40):
+def make_maps():
     """Return a pattern in [mm] and a traction in [kPa], both even enough to be told apart by cells."""
-    rng = np.random.default_rng(seed)
-    pattern = np.kron(rng.uniform(0, 0.5, (8, 8)), np.ones((size // 8, size // 8))).astype(np.float32)
+    rng = np.random.default_rng(0)
+    pattern = np.kron(rng.uniform(0, 0.5, (8, 8)), np.ones((5, 5))).astype(np.float32)
     traction = np.kron(rng.normal(0, 20, (3, 4, 4)), np.ones((1, 2, 2))).astype(np.float32)
     return pattern, traction
 
@@ -101,24 +75,10 @@ def test_readings_of_this_pad_alone_leave_nothing():
     assert forward.mismatch(operator, tap, 0 * pattern, 0 * traction, GAIN_ERROR) == pytest.approx(1)
 
 
-class TestFeatures:
-    def test_they_are_means_of_cells(self):
-        pattern, traction = make_maps()
-        found = features(pattern, traction)
-        assert found.shape == (GRID**2 * 3,) and found.dtype == np.float32
-        assert found[: GRID**2] == pytest.approx(pattern[::5, ::5].ravel(), rel=1e-5)
-        assert found[GRID**2 :] == pytest.approx(traction[:2].ravel() / KPA, rel=1e-5)
-        assert condensed(found[None])[0, GRID**2 :] == pytest.approx(traction[:2, ::2, ::2].ravel() / KPA, rel=1e-5)
-        for size in (12, 20, 36, 64):  # whatever the scale
-            pattern = np.random.default_rng(0).uniform(0, 1, (size, size)).astype(np.float32)
-            assert features(pattern, traction)[: GRID**2].mean() == pytest.approx(pattern.mean(), rel=1e-4)
-
-    def test_those_of_a_contact_depend_little_on_its_force(self):
-        tap = np.random.default_rng(0).uniform(0.5, 3, (3, 4, 4)).astype(np.float32)
-        pad = np.ones(5, dtype=np.float32)
-        (light,), (firm,) = contact_features(tap, pad), contact_features(20 * tap, pad)
-        assert light[:48] == pytest.approx(firm[:48], rel=0.03)
-        assert firm[48] - light[48] == pytest.approx(np.log(20), abs=0.03)
-        assert (light[49:] == pad).all() and (firm[49:] == pad).all()
-        tap[:], tap[0, 0, 0] = 0, 1e6
-        assert np.abs(contact_features(tap, pad)[0, :48]).max() <= 12, "a large reading beside none is bounded"
+def test_drag_is_condensed_to_means_and_large_readings_bounded():
+    pattern, traction = make_maps()
+    found = condensed(features(pattern, traction)[None])[0]
+    assert found[GRID**2 :] == pytest.approx(traction[:2, ::2, ::2].ravel() / KPA, rel=1e-5)
+    tap = np.zeros((3, 4, 4), dtype=np.float32)
+    tap[0, 0, 0] = 1e6
+    assert np.abs(contact_features(tap, np.ones(5, dtype=np.float32))[0, :48]).max() <= 12
