@@ -19,6 +19,7 @@ from train.learning.checkpoint import Training, fit_network, infer, load_network
 from train.learning.interval_fit import interval_coverage
 from train.learning.training_loop import DivergedError, Recipe, learning_rate_share, train
 from train.networks.blocks import PatternNet, RelativeError
+from train.networks.published import SrganObjective
 from train.physics.pad_draws import KNOWN
 
 SMALL = {"channels": 16, "blocks": 1, "known": KNOWN}
@@ -204,12 +205,6 @@ def weights(net):
     return torch.cat([value.flatten() for value in net.state_dict().values()])
 
 
-def trained(tmp_path, recipe=RECIPE, **options):
-    net = new_net()
-    train(net, RelativeError(), batches, recipe, tmp_path / "net.resume", **options)
-    return net
-
-
 def test_the_rate_rises_for_a_tenth_and_falls_to_nothing():
     for wrong in ({"steps": 0}, {"batch": 0}, {"learning_rate": -1.0}):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*, expected more than 0"):
@@ -221,7 +216,8 @@ def test_the_rate_rises_for_a_tenth_and_falls_to_nothing():
 
 @pytest.mark.parametrize("killed_at", [1, 7, 11])
 def test_a_run_that_was_killed_goes_on_as_if_it_were_not(tmp_path, killed_at):
-    whole, seen = trained(tmp_path), []
+    """With the objective that has weights and draws of its own."""
+    seen = []
 
     def until_killed(number):
         if number == killed_at:
@@ -232,20 +228,23 @@ def test_a_run_that_was_killed_goes_on_as_if_it_were_not(tmp_path, killed_at):
         seen.append(number)
         return batches(number)
 
+    whole = new_net()
+    train(whole, SrganObjective(seed=3), batches, RECIPE, tmp_path / "whole.resume")
     with pytest.raises(InterruptedError):
-        train(new_net(), RelativeError(), until_killed, RECIPE, tmp_path / "net.resume", keep_every_s=-1.0)
+        train(new_net(), SrganObjective(seed=3), until_killed, RECIPE, tmp_path / "net.resume", keep_every_s=-1.0)
     torch.manual_seed(99)
     resumed = Map()
-    _, course = train(resumed, RelativeError(), recorded, RECIPE, tmp_path / "net.resume")
+    _, course = train(resumed, SrganObjective(seed=8), recorded, RECIPE, tmp_path / "net.resume")
     assert seen == list(range(killed_at, 12)) and [*course] == list(range(1, 13))
     assert torch.equal(weights(whole), weights(resumed))
 
 
 @pytest.mark.parametrize(("steps", "identity"), [(13, "these data"), (12, "others")])
 def test_a_run_of_another_recipe_is_not_continued(tmp_path, steps, identity):
-    trained(tmp_path, identity="these data", keep_every_s=-1.0)
+    net, objective, path = new_net(), RelativeError(), tmp_path / "net.resume"
+    train(net, objective, batches, RECIPE, path, identity="these data", keep_every_s=-1.0)
     with pytest.raises(CheckpointError, match="delete it"):
-        trained(tmp_path, replace(RECIPE, steps=steps), identity=identity)
+        train(net, objective, batches, replace(RECIPE, steps=steps), path, identity=identity)
 
 
 def test_a_loss_that_is_no_number_ends_the_run_before_its_step(tmp_path):
