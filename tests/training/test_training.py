@@ -13,8 +13,8 @@ from edge.evaluation.metrics import psnr_db
 from train.data.frozen_presses import freeze_presses
 from train.data.press_batches import Batch
 from train.data.presses import SEED
-from train.errors import CheckpointError, DatasetError
-from train.fit import bundled, main
+from train.errors import CheckpointError
+from train.fit import main
 from train.learning.checkpoint import Training, fit_network, infer, load_network
 from train.learning.interval_fit import interval_coverage
 from train.learning.training_loop import DivergedError, Recipe, learning_rate_share, train
@@ -111,12 +111,6 @@ def test_a_training_begins_with_the_weights_of_another(folder, data, validation,
     assert all(torch.allclose(first[name], further[name]) for name in first if name != "deviation_scale")
 
 
-def test_the_bundled_networks_need_presses_of_seven_taps(data):
-    assert [one.name for one in bundled(make_press_set(taps=7))] == ["stsr", "stsr-small", "mtsr"]
-    with pytest.raises(DatasetError, match="at most 2 taps, the bundled networks take 7"):
-        bundled(data)
-
-
 def test_one_network_by_the_command(data, tmp_path, capsys):
     data.save(tmp_path / "data.npz")
     files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / "data.npz")]
@@ -126,42 +120,38 @@ def test_one_network_by_the_command(data, tmp_path, capsys):
     assert load_network(tmp_path / "fusion-mtsr2.pt")[1]["config"]["recipe"]["bf16"] is True
 
 
+FUSION = ["--network", "fusion-mtsr2"]
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [
         (["--data", "absent.npz"], "no such file"),
+        ([], "at most 2 taps, the bundled networks take 7"),
         (["--network", "mtsr4"], "no sequences of 4 taps"),
         (["--network", "fusion-mtsr4"], "no sequences of 3 taps"),
         (["--network", "compact-stsr", "--start-from", "absent"], "absent.pt"),
+        (
+            [*FUSION, "--validation", "single.npz"],
+            "the validation set .*has 48 sequences of 1 taps that are only turned, .*; expected some of 2 taps, at x10",
+        ),
+        ([*FUSION, "--validation", "moved.npz"], "the validation set .*has 0 sequences of 2 taps that are only turned"),
+        (
+            [*FUSION, "--validation", "coarse.npz"],
+            "the validation set .*at x2 of 4 x 4 taxels; expected some of 2 taps, at x10 of 4 x 4",
+        ),
+        ([*FUSION, "--data", "data.npz", "coarse.npz"], "the presses are at x10 of 4 x 4 taxels and x2 of 4 x 4"),
     ],
 )
-def test_what_cannot_be_trained_is_said_in_one_line(data, tmp_path, options, told):
-    data.save(tmp_path / "data.npz")
-    given = [] if "--data" in options else ["--data", str(tmp_path / "data.npz")]
-    given += ["--validation", str(tmp_path / "data.npz")]
-    with pytest.raises(SystemExit, match=rf"^fit: .*{told}[^\n]*$"):
-        main([str(tmp_path), *given, *options, "--steps", "1"])
-
-
-def test_presses_that_do_not_belong_together_are_refused_first(data, tmp_path):
+def test_what_cannot_be_trained_is_said_in_one_line(data, tmp_path, monkeypatch, options, told):
+    monkeypatch.chdir(tmp_path)
     data.save(tmp_path / "data.npz")
     coarse = {name: getattr(data, name)[:, ::5, ::5] for name in ("patterns", "touching")}
     replace(data, **coarse).save(tmp_path / "coarse.npz")
     data.with_taps(1).save(tmp_path / "single.npz")
     replace(data, poses=data.poses + 1).save(tmp_path / "moved.npz")
-    refused = {
-        "single": r"has 48 sequences of 1 taps that are only turned, .*; expected some of 2 taps, at x10 of 4 x 4 as",
-        "moved": "has 0 sequences of 2 taps that are only turned",
-        "coarse": "at x2 of 4 x 4 taxels; expected some of 2 taps, at x10 of 4 x 4",
-    }
-    options = ["--network", "fusion-mtsr2", "--steps", "1"]
-    for name, told in refused.items():
-        files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / f"{name}.npz")]
-        with pytest.raises(SystemExit, match=rf"^fit: the validation set [^\n]*{told}[^\n]*$"):
-            main([str(tmp_path), *files, *options])
-    files = ["--data", str(tmp_path / "data.npz"), str(tmp_path / "coarse.npz"), "--validation", files[-1]]
-    with pytest.raises(SystemExit, match=r"^fit: the presses are at x10 of 4 x 4 taxels and x2 of 4 x 4 taxels, .*$"):
-        main([str(tmp_path), *files, *options])
+    with pytest.raises(SystemExit, match=rf"^fit: [^\n]*{told}[^\n]*$"):
+        main([".", "--data", "data.npz", "--validation", "data.npz", "--steps", "1", *options])
 
 
 def test_a_full_disk_is_one_line(data, tmp_path):
