@@ -3,7 +3,6 @@
 import pytest
 import torch
 from press_samples import make_press_set
-from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from train.data.press_batches import Batch, PosedBatches
@@ -66,25 +65,17 @@ def test_light_pulls_count_as_much_as_firm_ones():
 def test_what_earlier_taps_make_worse_costs_more():
     truth = truth_like(torch.zeros(2, 8, 8)) + 0.1
 
-    class Off(nn.Module):
-        def __init__(self, many: float, one: float) -> None:
-            super().__init__()
-            self.many, self.one = many, one
-
-        def forward(self, window, *_):
-            off = self.one if window.shape[1] == 3 else self.many
+    def loss(many: float, one: float, posed: bool = True) -> float:
+        def net(window, *_):
+            off = one if window.shape[1] == 3 else many
             return truth * (1 + off), torch.full_like(truth, 0.1), torch.zeros(2, 3, 4, 4)
 
-    def loss(many: float, one: float, posed: bool = True) -> float:
         batch = Batch(window(2), truth, poses=torch.zeros(2, 4, 5) if posed else None)
-        return float(HeteroscedasticError().loss(Off(many, one), batch))
+        return float(HeteroscedasticError().loss(net, batch))
 
     assert loss(0.2, 0.4) == pytest.approx(loss(0.2, 0.2)) == pytest.approx(loss(0.2, 0.1, posed=False))
     assert loss(0.2, 0.05) - loss(0.2, 0.1) == pytest.approx(loss(0.2, 0.1) - loss(0.2, 0.2), rel=0.05)
     assert loss(0.2, 0.1) > loss(0.2, 0.2) + 0.2
-
-
-TOLERANCE = 1e-5
 
 
 def moved(maps, channels: Channels, number: int):
@@ -111,61 +102,41 @@ def test_the_whole_network_keeps_every_symmetry(group, count, cols):
             for number in range(count):
                 for got, maps, kind in zip(net(moved(given, enter, number), pad), outputs, kinds, strict=True):
                     expected = moved(maps.reshape(3, len(kind), *maps.shape[-2:]), kind, number).reshape(got.shape)
-                    assert (got - expected).abs().max() <= TOLERANCE * maps.abs().max()
+                    assert (got - expected).abs().max() <= 1e-5 * maps.abs().max()
 
 
-KNOWN = 5
-
-
-@pytest.fixture(scope="module")
-def fused():
-    """Small network whose earlier taps matter."""
+def test_fused_taps_turn_together_and_have_no_order():
     torch.manual_seed(0)
-    net = FusionNet(7, 10, channels=16, blocks=2, known=KNOWN).eval()
-    for part in (net.receive, net.revise):
+    net = FusionNet(7, 10, channels=16, blocks=2, known=5).eval()
+    for part in (net.receive, net.revise):  # or earlier taps would not matter before training
         for free in part.parameters():
             torch.nn.init.normal_(free, 0, 0.1)
     net.own_share.data += 0.3
-    return net
-
-
-@pytest.fixture(scope="module")
-def inputs():
     rng = torch.Generator().manual_seed(1)
-    window, pad = torch.randn(2, 9, 4, 4, generator=rng), torch.randn(2, KNOWN, generator=rng)
+    window, pad = torch.randn(2, 9, 4, 4, generator=rng), torch.randn(2, 5, generator=rng)
     poses = torch.randn(2, 3, 5, generator=rng) * torch.tensor([2, 2, 30, 0.3, 1.0])
     poses[:, :, 3:] = poses[:, :, 3:].abs()
     poses[:, 0] = 0
-    return window, pad, poses
 
+    @torch.inference_mode()
+    def pattern_of(window, poses):
+        return net(window, pad, poses)[0]
 
-def run(net, *inputs):
-    with torch.inference_mode():
-        return net(*inputs)
-
-
-def test_a_quarter_turn_of_everything_turns_the_pattern(fused, inputs):
-    window, pad, poses = inputs
+    pattern, alone = pattern_of(window, poses), pattern_of(window[:, :3], poses[:, :1])
+    assert not torch.allclose(pattern, alone, atol=1e-3)
+    empty = torch.cat([window[:, :3], torch.zeros(2, 6, 4, 4)], dim=1)
+    assert torch.equal(pattern_of(empty, poses), alone), "one tap is one tap after training, too"
+    order = [0, 2, 1]
+    shuffled = window.unflatten(1, (3, 3))[:, order].flatten(1, 2)
+    assert torch.allclose(pattern_of(shuffled, poses[:, order]), pattern, atol=1e-6)
+    longer = torch.cat([window, torch.zeros(2, 6, 4, 4)], dim=1)
+    padded = torch.cat([poses, torch.zeros(2, 2, 5)], dim=1)
+    assert torch.allclose(pattern_of(longer, padded), pattern, atol=1e-6)
     turned = torch.rot90(window.unflatten(1, (3, 3)), 1, (-2, -1))
     turned = torch.stack([turned[:, :, 1], -turned[:, :, 0], turned[:, :, 2]], dim=2).flatten(1, 2)
     round_ = poses.clone()
     round_[..., 0], round_[..., 1] = poses[..., 1], -poses[..., 0]
-    expected = torch.rot90(run(fused, window, pad, poses)[0], 1, (-2, -1))
-    assert torch.allclose(run(fused, turned, pad, round_)[0], expected, atol=1e-5)
-
-
-def test_order_and_absence_of_earlier_taps_change_nothing(fused, inputs):
-    window, pad, poses = inputs
-    pattern, alone = (run(fused, window[:, : 3 * taps], pad, poses[:, :taps])[0] for taps in (3, 1))
-    assert not torch.allclose(pattern, alone, atol=1e-3)
-    empty = torch.cat([window[:, :3], torch.zeros(2, 6, 4, 4)], dim=1)
-    assert torch.equal(run(fused, empty, pad, poses)[0], alone)
-    order = [0, 2, 1]
-    shuffled = window.unflatten(1, (3, 3))[:, order].flatten(1, 2)
-    assert torch.allclose(run(fused, shuffled, pad, poses[:, order])[0], pattern, atol=1e-6)
-    longer = torch.cat([window, torch.zeros(2, 6, 4, 4)], dim=1)
-    padded = torch.cat([poses, torch.zeros(2, 2, 5)], dim=1)
-    assert torch.allclose(run(fused, longer, pad, padded)[0], pattern, atol=1e-6)
+    assert torch.allclose(pattern_of(turned, round_), torch.rot90(pattern, 1, (-2, -1)), atol=1e-5)
 
 
 def test_every_parameter_has_a_gradient():
@@ -262,16 +233,8 @@ def test_weights_that_do_not_fit_are_refused(start, name, options):
 
 def test_the_penalty_is_that_of_a_linear_critic():
     # f(x) = w . x has the slope |w| everywhere: the loss is w . (false - true) + 10 (|w| - 1)^2.
-    class Linear(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.weight = nn.Parameter(torch.full((8, 8), 0.5))
-
-        def forward(self, x):
-            return (x * self.weight).sum(dim=(1, 2))
-
     objective = SrganObjective()
-    objective.critic = Linear()  # type: ignore[assignment]
+    objective.critic = lambda patterns: 0.5 * patterns.sum(dim=(1, 2))
     false, true = torch.rand(2, 6, 8, 8, generator=torch.Generator().manual_seed(1))
     expected = 0.5 * (false - true).sum(dim=(1, 2)).mean() + 10 * (4.0 - 1) ** 2
     assert torch.allclose(objective.critic_loss(false, true), expected, rtol=1e-4)
