@@ -24,9 +24,6 @@ from edge.evaluation.test_set import judge_model, load_frozen_set, mean_error
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 
-FROZEN = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-MTSR = Subject("mtsr", str(find_model("mtsr")))
-
 
 def test_every_model_has_its_error_and_run_time_on_a_page(tmp_path):
     """But for the error of one of another scale; a broken one is left out."""
@@ -53,8 +50,8 @@ def test_every_model_has_its_error_and_run_time_on_a_page(tmp_path):
 
 
 def test_the_error_is_that_which_contracts_are_judged_by():
-    session, some = ModelSession(find_model("mtsr")), FROZEN.thinned(9)
-    rows = list(error_rows(MTSR, some))
+    session, some = ModelSession(find_model("mtsr")), load_frozen_set(BUNDLE_DIR / "frozen.npz").thinned(9)
+    rows = list(error_rows(Subject("mtsr", str(find_model("mtsr"))), some))
     assert [row.given for row in rows] == [1, session.contract.taps]
     for row in rows:
         assert row.error == mean_error(judge_model(session, some, row.given))
@@ -137,18 +134,15 @@ def test_a_source_has_changed_where_its_code_has(tmp_path):
     assert file_hash(path) != before
 
 
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
+def test_a_report_is_stale_and_the_line_says_why(made, tmp_path, capsys):
+    (tmp_path / "load").mkdir()
+    for change, why in (
         ({"models": {"gone.onnx": "0" * 12}}, "gone.onnx is not here"),
         ({"sources": {SOURCE: "0" * 12}}, f"{SOURCE} has changed"),
-    ],
-)
-def test_a_report_is_stale_and_the_line_says_why(made, tmp_path, capsys, change, why):
-    (tmp_path / "load").mkdir()
-    (tmp_path / "load/mine.md").write_text(with_head("# mine\n", replace(made, **change)))
-    reports.main([str(tmp_path)])
-    assert capsys.readouterr().out == f"load/mine.md: stale, of {made.date[:10]} ({made.commit}): {why}\n"
+    ):
+        (tmp_path / "load/mine.md").write_text(with_head("# mine\n", replace(made, **change)))
+        reports.main([str(tmp_path)])
+        assert capsys.readouterr().out == f"load/mine.md: stale, of {made.date[:10]} ({made.commit}): {why}\n"
 
 
 def test_every_report_has_a_head():

@@ -1,10 +1,15 @@
-"""The second world obeys the closed forms of an elastic half-space."""
+"""The second world obeys the closed forms of a half-space; and a non-negative pressure explains a press."""
 
 import numpy as np
 import pytest
 
+from edge.evaluation.metrics import psnr_db
 from firmware_bridge.pad_geometry import USPA44
+from train.experiments.nonnegative import NonnegativeInverse
 from train.experiments.second_world import movement, places, pressed
+from train.physics.contact import BARE
+from train.physics.gripped import GrippedPad
+from train.physics.pad_draws import Pad
 
 CELLS, RADIUS_MM, DEPTH_MM = 34, 4.0, 0.3
 CELL_MM = USPA44.width_mm / CELLS
@@ -47,3 +52,30 @@ def test_drag_moves_points_its_own_way_and_answers_to_pressure():
     far = np.hypot(moved[0, 0], moved[0, 1]) < 0.01
     for axis in (0, 1):
         assert moved[1 + axis, 2][far] == pytest.approx(-moved[0, axis][far], abs=1e-4)
+
+
+SHIFT_MM, TURN_DEG = 2.35, 60
+
+
+def test_a_pressure_explains_a_press_its_drag_and_its_taps():
+    """A dome beside the middle: by the pad, by one that is shifted and turned, and once more with drag."""
+    gripped, inverse = GrippedPad(Pad()), NonnegativeInverse(Pad(), gain_error=0.02)
+    x_mm, y_mm = gripped.places_mm
+    cosine, sine = np.cos(np.radians(TURN_DEG)), np.sin(np.radians(TURN_DEG))
+    moved = (SHIFT_MM + cosine * x_mm - sine * y_mm, sine * x_mm + cosine * y_mm)
+    heights_mm = np.stack([-(np.hypot(x - 3, y + 2) ** 2) / 12 for x, y in ((x_mm, y_mm), moved, (x_mm, y_mm))])
+    slides_mm = np.array([[0.0, 0.0], [0.0, 0.0], [0.3, 0.1]])
+    done = gripped.press(heights_mm, np.full(3, 0.4), slides_mm, np.zeros(3), np.full(3, 0.6), [BARE] * 3)
+
+    def found_db(taps, *poses):
+        pattern = inverse(done.counts[taps], np.array([(0, 0, 0), *poses], dtype=float))
+        assert pattern.min() >= 0
+        return float(psnr_db(pattern[None], done.patterns[:1], 0.5)[0])
+
+    assert found_db([0]) > 30
+    assert np.abs(done.counts[2] - done.counts[0]).max() > 100
+    assert found_db([2]) > 29, "drag is no other press"
+    right = found_db([0, 1], (SHIFT_MM, 0, TURN_DEG))
+    assert right > 30
+    for wrong in ((-SHIFT_MM, 0, TURN_DEG), (SHIFT_MM, 0, -TURN_DEG)):
+        assert right > found_db([0, 1], wrong) + 3

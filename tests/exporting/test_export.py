@@ -8,20 +8,11 @@ import onnx
 import pytest
 import torch
 from edge_samples import make_contract
-from export_samples import (
-    BEFORE,
-    INTERVALS,
-    OPTIONS,
-    PRESSES,
-    SURE,
-    save_checkpoint,
-    small_models,
-    some_frames,
-)
 from onnx import numpy_helper
+from press_samples import make_press_set
 
 from edge.evaluation.test_set import judge, load_frozen_set, mean_error
-from edge.inference.bundled import BUNDLE_DIR, bundled_models, find_model
+from edge.inference.bundled import BUNDLE_DIR, find_model
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.intervals import WORTH_A_TAP, doubt, expect, is_confidence, regions
 from edge.inference.onnx_session import ModelSession
@@ -29,27 +20,57 @@ from export import to_onnx
 from export.graph import ParityError
 from export.parity import check_parity
 from export.to_onnx import BINS, doubts_and_errors, export, fit_confidence, main
-from export.verify import verify
-from train.data.frozen_presses import load_frozen_presses
-from train.errors import CheckpointError
-from train.learning.checkpoint import infer, load_network, network_of, origin_of
+from train.data.frozen_presses import freeze_presses, load_frozen_presses
+from train.learning.checkpoint import Training, fit_network, infer, load_network, network_of, origin_of
 from train.learning.interval_fit import half_width_mm, interval_coverage, readings_of_presses
+from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet
 from train.networks.named_networks import build
+from train.physics.pad_draws import KNOWN
 from train.surfaces.poses import REACH_MM
 from train.trust import load_trust
+
+OPTIONS = {"channels": 16, "blocks": 1, "known": KNOWN}
+PRESSES = make_press_set(count=64, taps=2)
+SURE = Training("sure", "fusion-mtsr2", Recipe(steps=2, batch=4, given=(0.5, 0.5)), options=OPTIONS)
+INTERVALS = {"validation": PRESSES, "intervals": PRESSES, "steps": 50}
+BEFORE = b"the one before"
 
 
 @pytest.fixture(scope="module")
 def frozen():
-    return some_frames()
+    """A few presses, which are not those of any training."""
+    return freeze_presses(make_press_set(24, taps=2, seed=1), 1).as_frozen_set()
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(tmp_path_factory, frozen):
+    """A small network as training leaves it in sure.pt, and sure.onnx with intervals and checks."""
     folder = tmp_path_factory.mktemp("models")
-    small_models(folder)
+    fit_network(SURE, PRESSES, frozen, folder)
+    net, _ = load_network(folder / "sure.pt")
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for name in ("receive", "revise"):  # two steps are too few for earlier taps to matter
+            for free in net.get_submodule(name).parameters():
+                torch.nn.init.normal_(free, 0, 0.1)
+        net.get_parameter("log_reach")[0] += 0.1  # a graph holds equal numbers once
+        # The exporter folds weights of 0, and without a lift most patterns would be zero everywhere.
+        for weight in net.get_submodule("context").parameters():
+            torch.nn.init.normal_(weight, 0, 0.05)
+        net.get_parameter("leave.2.bias_free").add_(0.02)
+    torch.save(net.state_dict(), folder / "sure.pt")
+    (folder / "sure.onnx").write_bytes(BEFORE)
+    export(folder / "sure.pt", folder, frozen, trust=load_trust(find_model("stsr-int8")), **INTERVALS)
     return folder
+
+
+def save_checkpoint(path, net, name, **options):
+    """Write weights as they are, which is enough to be exported."""
+    torch.save(net.state_dict(), path)
+    report = {"network": name, "scale": net.scale, "options": options}
+    path.with_suffix(".json").write_text(json.dumps(report | {"contact_level": 0.5, "training_sha256": "ab" * 32}))
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +84,7 @@ def net(folder):
     return network_of(onnx.load(folder / "sure.onnx"))
 
 
-def test_an_exported_network_keeps_its_contract(folder, session, frozen):
+def test_a_file_keeps_its_contract_and_no_traces_of_the_machine(folder, session, frozen):
     contract, report = session.contract, json.loads((folder / "sure.json").read_text())
     assert (contract.version, contract.taps, contract.scale, contract.sensor) == (CONTRACT_VERSION, 2, 10, "uSPa44")
     assert (contract.counts_per_unit, contract.angle_step_deg) == ((500.0, 500.0, 1000.0), 5.0)
@@ -72,6 +93,10 @@ def test_an_exported_network_keeps_its_contract(folder, session, frozen):
     assert contract.test_set_sha256 == frozen.sha256() and contract.output_full_scale == frozen.full_scale_mm
     assert (contract.takes_poses, contract.reach_mm) == (True, REACH_MM) and contract.read_trust() is not None
     assert contract.window_shape == (ANY_BATCH, "taps", 3, 4, 4)
+    content = (folder / "sure.onnx").read_bytes()
+    assert b".py" not in content and b"/tmp" not in content
+    assert not any(init.external_data for init in onnx.load_from_string(content).graph.initializer)
+    assert (folder / "sure.onnx.bak").read_bytes() == BEFORE
 
 
 def test_the_runtime_computes_what_was_trained(folder, session, net, frozen):
@@ -99,37 +124,26 @@ def test_the_contract_states_errors_by_number_of_taps(session, net, frozen):
 
 
 @pytest.mark.parametrize("name", ["sure", pytest.param("sure-int8", marks=pytest.mark.night)])
-def test_intervals_hold_on_the_presses_that_set_them(folder, name, tmp_path):
+def test_intervals_hold_on_the_presses_that_set_them(folder, frozen, name, tmp_path):
     if name != "sure":
-        export(folder / "sure.pt", tmp_path, some_frames(), calibration=PRESSES, **INTERVALS)
+        export(folder / "sure.pt", tmp_path, frozen, calibration=PRESSES, **INTERVALS)
     session = ModelSession((folder if name == "sure" else tmp_path) / f"{name}.onnx")
     for given in (1, 2):
-        assert_intervals_hold(session, given)
+        held: dict[int, list[bool]] = {}
+        for one in readings_of_presses(PRESSES, 2):
+            for window, pad, truth in zip(one.with_taps(given), one.pads, one.truth, strict=True):
+                pattern = session.run(window.reshape(2, 3, 4, 4), pad)
+                region = regions(pattern[None], session.contract.contact_level, 4)[0]
+                inside = np.abs(pattern - truth) <= half_width_mm(session.deviation)
+                for number in np.unique(region):
+                    held.setdefault(int(number), []).extend(inside[region == number].tolist())
+        shares = [float(np.mean(share)) for share in held.values() if len(share) > 100]  # fewer pixels tell little
+        assert len(shares) > 1 and shares == pytest.approx([0.9] * len(shares), abs=0.02)
     levels = session.contract.interval_levels
     assert list(levels) == ["50", "80", "90", "95"]
     # Far from a contact most errors of integers are zero, for which there is a least width.
     assert levels["90"][:3] == pytest.approx([float(half_width_mm(1.0))] * 3, rel=0.02)
     assert all(low <= high for low, high in zip(levels["50"], levels["95"], strict=True))
-
-
-def assert_intervals_hold(session, given):
-    held: dict[int, list[bool]] = {}
-    for one in readings_of_presses(PRESSES, 2):
-        for window, pad, truth in zip(one.with_taps(given), one.pads, one.truth, strict=True):
-            pattern = session.run(window.reshape(2, 3, 4, 4), pad)
-            region = regions(pattern[None], session.contract.contact_level, 4)[0]
-            inside = np.abs(pattern - truth) <= half_width_mm(session.deviation)
-            for number in np.unique(region):
-                held.setdefault(int(number), []).extend(inside[region == number].tolist())
-    shares = [float(np.mean(share)) for share in held.values() if len(share) > 100]  # fewer pixels tell little
-    assert len(shares) > 1 and shares == pytest.approx([0.9] * len(shares), abs=0.02)
-
-
-def test_a_file_has_no_traces_of_the_machine(folder):
-    content = (folder / "sure.onnx").read_bytes()
-    assert b".py" not in content and b"/tmp" not in content
-    assert not any(init.external_data for init in onnx.load_from_string(content).graph.initializer)
-    assert (folder / "sure.onnx.bak").read_bytes() == BEFORE
 
 
 @pytest.mark.parametrize("head", ["leave", "uncertainty", "traction"])
@@ -144,7 +158,7 @@ def test_a_graph_that_computes_something_else_is_no_parity(folder, session, net,
         check_parity(net, model, frozen, session.contract)
 
 
-def test_a_published_network_has_one_output_and_no_checks(tmp_path):
+def test_a_published_network_has_one_output_and_no_checks(frozen, tmp_path):
     """Its batch normalisation is folded; a pattern of another surface's taps would be believed."""
     net = build("mtsr2", 2)
     with torch.no_grad():
@@ -153,7 +167,7 @@ def test_a_published_network_has_one_output_and_no_checks(tmp_path):
             if held.is_floating_point():
                 torch.nn.init.uniform_(held, *((0.5, 2) if name.endswith("var") else (-1, 1)))
     path = save_checkpoint(tmp_path / "peer.pt", net, "mtsr2")
-    line, _ = export(path, tmp_path, some_frames(), trust=load_trust(find_model("stsr-int8")))
+    line, _ = export(path, tmp_path, frozen, trust=load_trust(find_model("stsr-int8")))
     assert "x2, not evaluated, the test set is of x10, parity" in line
     session = ModelSession(tmp_path / "peer.onnx")
     contract = session.contract
@@ -163,26 +177,15 @@ def test_a_published_network_has_one_output_and_no_checks(tmp_path):
     assert "BatchNormalization" not in {node.op_type for node in onnx.load(tmp_path / "peer.onnx").graph.node}
 
 
-def test_a_checkpoint_of_an_earlier_release_is_refused(folder, frozen, tmp_path):
-    report = json.loads((folder / "sure.json").read_text())
-    del report["contact_level"]
-    (tmp_path / "old.pt").write_bytes((folder / "sure.pt").read_bytes())
-    (tmp_path / "old.json").write_text(json.dumps(report))
-    with pytest.raises(CheckpointError, match=r"no 'contact_level'"):
-        export(tmp_path / "old.pt", tmp_path, frozen)
-    assert not list(tmp_path.glob("*.onnx"))
-
-
 def test_the_command_writes_integers_and_says_what_they_cost(tmp_path, limits, capsys):
     PRESSES.pick(np.arange(32)).save(tmp_path / "taps.npz")
-    limits(to_onnx, MOST_LOSS_DB=-100.0)
+    limits(to_onnx, MOST_LOSS_DB=-100.0, MOST_COVERAGE_CHANGE=-1.0)
     net = build("compact-stsr", 10, **OPTIONS)
     net.get_parameter("leave.2.bias_free").data += 0.02  # or no pattern would be above zero
     words = [str(save_checkpoint(tmp_path / "one.pt", net, "compact-stsr", **OPTIONS)), "--out", str(tmp_path)]
     words += [word for name in ("--validation", "--test", "--int8") for word in (name, str(tmp_path / "taps.npz"))]
-    with pytest.raises(
-        SystemExit, match=r"^export: quantisation costs too much in one-int8\.onnx .*: use the float32 model"
-    ):
+    told = r"one-int8\.onnx \(more than .* dB and an interval changed by more than .*\): use the float32 model"
+    with pytest.raises(SystemExit, match=f"^export: quantisation costs too much in {told}"):
         main(words)
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith("one-int8.onnx: ") and "dB lost" in line
@@ -190,7 +193,7 @@ def test_the_command_writes_integers_and_says_what_they_cost(tmp_path, limits, c
     assert contract.arithmetic == "int8" and set(contract.test_error) == {"1"} == set(contract.confidence)
     assert contract.test_set_sha256 != load_frozen_set(BUNDLE_DIR / "frozen.npz").sha256(), "it is of --test"
     path.write_bytes(b"better")
-    with pytest.raises(SystemExit, match=r"one-int8\.onnx \(more than .* dB; the file that was there stays\)"):
+    with pytest.raises(SystemExit, match=r"one-int8\.onnx \(more than .* dB and .*; the file that was there stays\)"):
         main(words)
     assert path.read_bytes() == b"better" and not [*tmp_path.glob("*.bak")]
 
@@ -200,32 +203,20 @@ def test_what_cannot_be_exported_ends_in_one_line(folder, tmp_path):
     coarse = {name: getattr(PRESSES, name)[:, ::5, ::5] for name in ("patterns", "touching")}
     replace(PRESSES, **coarse).save(tmp_path / "coarse.npz")
     (tmp_path / "taken").write_text("")
-    sure, none = str(folder / "sure.pt"), str(tmp_path / "none.pt")
+    (tmp_path / "old.pt").write_bytes((folder / "sure.pt").read_bytes())
+    of_an_earlier_release = (folder / "sure.json").read_text().replace('"contact_level"', '"level"')
+    (tmp_path / "old.json").write_text(of_an_earlier_release)
+    sure, none, old = str(folder / "sure.pt"), str(tmp_path / "none.pt"), str(tmp_path / "old.pt")
     for checkpoints, presses, out, told in (
         ([sure], "taps", "taken", "taken: File exists"),
         ([sure, none], "taps", "", r"none\.pt is no checkpoint .*No such file"),
+        ([old], "taps", "", "no 'contact_level'"),
         ([sure], "coarse", "", "sure.pt is at x10 of a uSPa44, the validation presses are not"),
     ):
         files = ["--validation", str(tmp_path / f"{presses}.npz"), "--out", str(tmp_path / out)]
         with pytest.raises(SystemExit, match=rf"^export: [^\n]*{told}[^\n]*$"):
             main([*checkpoints, *files])
     assert not [*tmp_path.glob("*.onnx")]
-
-
-def test_what_integers_cost_too_much_is_said():
-    in_float = {"psnr_db": 35.0, "coverage_90": 0.9}
-    for psnr_db, coverage, exceeded in (
-        (34.95, 0.9, ""),
-        (34.8, 0.9, f"more than {to_onnx.MOST_LOSS_DB} dB"),
-        (34.95, 0.84, "an interval changed by more than 2%"),
-    ):
-        found = to_onnx.cost(in_float, {"psnr_db": psnr_db, "coverage_90": coverage})
-        assert found == ([f"{35 - psnr_db:.3f} dB lost to quantisation"], exceeded)
-
-
-def test_single_taps_are_verified_too(folder):
-    rows = list(verify(folder / "sure.onnx", some_frames()))
-    assert {"test set", "one tap"} <= {row.windows for row in rows} and not [row for row in rows if row.broken]
 
 
 def test_a_single_tap_reads_no_memory_that_nobody_wrote(folder):
@@ -241,28 +232,20 @@ def test_a_single_tap_reads_no_memory_that_nobody_wrote(folder):
             assert np.allclose(session.run_together([window] * count), expected, atol=1e-6)
 
 
-IN_INTEGERS = [path for path in bundled_models() if path.stem.endswith("-int8")]
-"""Those in float have the same patterns within a hundredth: see the tests of parity."""
 TABLE = {
     "1": {"doubt": [0.1, 0.3], "error": [0.2, 0.4], "gain": [0.0, 0.1]},
     "2": {"doubt": [0.1, 0.3], "error": [0.1, 0.3], "gain": []},
 }
 
 
-def maps(about, size=0.5):
-    """A pattern of that RMS, and its deviation."""
-    pattern = np.full((40, 40), size, dtype=np.float32)
-    return pattern, about * pattern
-
-
 def test_the_error_is_interpolated_between_doubts():
+    pattern = np.full((40, 40), 0.5, dtype=np.float32)
     for about, share, another in ((0.05, 0.2, False), (0.139, 0.239, False), (0.2, 0.3, True), (0.6, 0.8, True)):
-        rmse, worth_it = expect(TABLE, 1, *doubt(*maps(about)))
+        rmse, worth_it = expect(TABLE, 1, *doubt(pattern, about * pattern))
         assert rmse == pytest.approx(0.5 * share, rel=1e-4) and worth_it is another and WORTH_A_TAP == 0.02
     assert expect(TABLE, 3, 0.2, 0.5) is None and expect({}, 1, 0.2, 0.5) is None
     assert expect(TABLE, 2, 0.2, 0.5) == (pytest.approx(0.1), None)
-    nothing = np.zeros((40, 40), dtype=np.float32)
-    assert doubt(nothing, nothing + 1) == (np.inf, 0.0) and expect(TABLE, 1, np.inf, 0.0) is None
+    assert doubt(0 * pattern, 0 * pattern + 1) == (np.inf, 0.0) and expect(TABLE, 1, np.inf, 0.0) is None
 
 
 def test_other_values_are_no_table():
@@ -279,17 +262,13 @@ class Oracle:
     name, contract = "oracle", make_contract(taps=2, interval_factor=1.6, counts_per_unit=(1.0, 1.0, 1.0))
 
     def __init__(self, frozen):
-        self.deviation = np.zeros((40, 40), dtype=np.float32)
-        self._truth = {frozen.newest[index].tobytes(): truth for index, truth in enumerate(frozen.patterns())}
-        self._rng = np.random.default_rng(1)
-        self._shares = dict.fromkeys(self._truth, 0.0)
-        for key in self._shares:
-            self._shares[key] = self._rng.uniform(0.05, 0.5)
+        shares = np.random.default_rng(1).uniform(0.05, 0.5, len(frozen.newest))
+        readings = [one.tobytes() for one in frozen.newest]
+        self._known = dict(zip(readings, zip(frozen.patterns(), shares, strict=True), strict=True))
 
     def run(self, window):
-        key = window[0].astype(np.int16).tobytes()
-        share = self._shares[key]
-        pattern = self._truth[key] * (1 + share * (1 - share * bool(window[1].any())))
+        truth, share = self._known[window[0].astype(np.int16).tobytes()]
+        pattern = truth * np.float32(1 + share * (1 - share * bool(window[1].any())))
         self.deviation = np.full_like(pattern, share * np.sqrt(np.mean(pattern**2)))
         return pattern
 
@@ -304,17 +283,17 @@ def test_the_table_finds_error_and_gain_by_doubt():
         assert gain == pytest.approx(about, rel=0.05)
 
 
-@pytest.mark.parametrize("path", IN_INTEGERS, ids=lambda path: path.stem)
-def test_the_expected_error_is_near_the_true_one(path):
+@pytest.mark.parametrize("name", ["stsr-int8", "stsr-small-int8", "mtsr-int8"])
+def test_the_expected_error_is_near_the_true_one(name):
     """The table is of other presses of the wide world; measured 1.05 to 1.09 of the true error, small ones 1.20.
 
     Quarters have .91 to 1.18, small ones to 1.38; correlation .66 to .72.
     """
-    session = ModelSession(path)
+    session = ModelSession(find_model(name))
     about, error, size = doubts_and_errors(session, 1, load_frozen_presses().as_frozen_set())
     told = session.contract.confidence["1"]
     expected = np.interp(about, told["doubt"], told["error"]) * size
-    of_all, of_quarter = (0.25, 0.45) if "small" in path.stem else (0.1, 0.25)
+    of_all, of_quarter = (0.25, 0.45) if "small" in name else (0.1, 0.25)
     assert expected.mean() == pytest.approx(error.mean(), rel=of_all)
     assert np.corrcoef(expected, error)[0, 1] > 0.6
     for part in np.array_split(np.argsort(expected), 4):

@@ -46,11 +46,6 @@ def graph_of(name):
     return model, Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
 
 
-def save(model, path):
-    path.write_bytes(model.SerializeToString())
-    return path
-
-
 @pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.night)])
 @pytest.mark.parametrize("name", MODELS)
 def test_every_bundled_model_keeps_every_bound(name, whole):
@@ -90,8 +85,9 @@ def test_a_model_that_computes_something_else_breaks_the_bound(tmp_path, capsys)
     last.output[0] = "less"
     model.graph.initializer.append(numpy_helper.from_array(np.float32(1.01), "more"))
     model.graph.node.append(onnx.helper.make_node("Mul", ["less", "more"], ["pattern"]))
+    (tmp_path / "off.onnx").write_bytes(model.SerializeToString())
     with pytest.raises(SystemExit, match=r"verify: \d+ of \d+ comparisons break a bound"):
-        main([str(save(model, tmp_path / "off.onnx")), "--out", str(tmp_path / "parity.md")])
+        main([str(tmp_path / "off.onnx"), "--out", str(tmp_path / "parity.md")])
     printed = capsys.readouterr().out
     assert "pattern differs by" in printed and "more than 1e-05" in printed
     assert printed.strip() in (tmp_path / "parity.md").read_text()
@@ -114,20 +110,6 @@ def test_integers_that_say_something_else_break_the_bound(pattern_factor, deviat
     given = [one * np.float32(factor) for one, factor in zip(expected, factors, strict=True)]
     _, change_db, broken = judged("test set", contract, expected, given, 0.501 * ones)
     assert said in broken and bool(said) == bool(broken) and (pattern_factor < 1) == (change_db < 0)
-
-
-@pytest.mark.parametrize(
-    ("beside", "complaint"),
-    [
-        ({"stsr.onnx": "stsr-small"}, r"stsr-int8\.onnx: .*stsr\.onnx is of another training than the model"),
-        ({}, r"the float32 model stsr\.onnx is not in the folder of its int8 model"),
-    ],
-)
-def test_integers_without_their_network_are_refused(tmp_path, beside, complaint):
-    for name, source in {"stsr-int8.onnx": "stsr-int8", **beside}.items():
-        (tmp_path / name).write_bytes(find_model(source).read_bytes())
-    with pytest.raises(SystemExit, match=complaint):
-        main([str(tmp_path / "stsr-int8.onnx")])
 
 
 def test_a_difference_is_a_share_of_the_larger_scale_and_finite():
@@ -155,55 +137,51 @@ def test_windows_are_of_every_force_and_stiff_ones_beside():
 
 
 @pytest.mark.parametrize(
-    ("content", "complaint"),
-    [(None, "cannot be read: No such file"), (b"\xff\xff\xff", "not an ONNX model"), (b"", "contract key 'version'")],
+    ("files", "complaint"),
+    [
+        ({}, r"stsr-int8\.onnx: cannot be read: No such file"),
+        ({"stsr-int8": b"\xff\xff\xff"}, r"stsr-int8\.onnx: not an ONNX model"),
+        ({"stsr-int8": b""}, r"stsr-int8\.onnx: contract key 'version'"),
+        (
+            {"stsr-int8": find_model("stsr-int8").read_bytes(), "stsr": find_model("stsr-small").read_bytes()},
+            r"stsr-int8\.onnx: .*stsr\.onnx is of another training than the model",
+        ),
+        (
+            {"stsr-int8": find_model("stsr-int8").read_bytes()},
+            r"the float32 model stsr\.onnx is not in the folder of its int8 model",
+        ),
+    ],
 )
-def test_what_is_no_model_ends_in_one_line(tmp_path, content, complaint):
-    path = tmp_path / "other.onnx"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(SystemExit, match=f"^verify: .*other.onnx: {complaint}"):
-        main([str(path)])
+def test_what_cannot_be_compared_ends_in_one_line(tmp_path, files, complaint):
+    for name, content in files.items():
+        (tmp_path / f"{name}.onnx").write_bytes(content)
+    with pytest.raises(SystemExit, match=rf"^verify: [^\n]*{complaint}"):
+        main([str(tmp_path / "stsr-int8.onnx")])
+
+
+def test_a_report_that_cannot_be_written_is_told_first(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(SystemExit, match=r"^verify: [^\n]*taken: File exists$"):
         main([str(find_model("stsr-small")), "--out", str(tmp_path / "taken/parity.md")])
 
 
-@pytest.fixture(scope="module")
-def model():
-    return graph_of("stsr-small")[0]
-
-
-@pytest.fixture(scope="module")
-def seen():
-    return calibration_batch(make_press_set(64, taps=1), graph_of("stsr-small")[1])
-
-
-@pytest.fixture(scope="module")
-def integers(model, seen):
-    return quantised(model, seen)
-
-
-def test_the_largest_grid_is_in_integers_but_for_outputs(model, integers, tmp_path):
+def test_the_largest_grid_is_in_integers_but_for_outputs(tmp_path):
+    """The same windows give the same bytes; what has no convolutions is refused."""
+    model, contract = graph_of("stsr-small")
+    seen = calibration_batch(make_press_set(64, taps=1), contract)
+    before = model.SerializeToString(deterministic=True)
+    integers, again = (quantised(model, seen).SerializeToString(deterministic=True) for _ in range(2))
+    assert model.SerializeToString(deterministic=True) == before
+    assert again == integers
     weights = {node.name: node.input[1] for node in model.graph.node if node.op_type == "Conv"}
     chosen = {weights[name] for name in integer_nodes(model) if name in weights}
     trunk = {f"trunk.{block}.body.{layer}.weight" for block in range(4) for layer in (0, 2)}
     assert chosen == trunk | {"leave.0.weight", "uncertainty.0.weight"}
     options = onnxruntime.SessionOptions()
     options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
-    onnxruntime.InferenceSession(integers.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    onnxruntime.InferenceSession(integers, options, providers=["CPUExecutionProvider"])
     run = [node.op_type for node in onnx.load(tmp_path / "optimised.onnx").graph.node]
     assert run.count("QLinearConv") == 10
-
-
-def test_the_same_windows_give_the_same_bytes(model, seen, integers):
-    before = model.SerializeToString(deterministic=True)
-    again = quantised(model, seen)
-    assert again.SerializeToString(deterministic=True) == integers.SerializeToString(deterministic=True)
-    assert model.SerializeToString(deterministic=True) == before
-
-
-def test_a_graph_without_convolutions_is_refused(seen):
     ends = [[onnx.helper.make_tensor_value_info(name, 1, [1, 6, 4, 4])] for name in ("window", "pattern")]
     graph = onnx.helper.make_graph([onnx.helper.make_node("Relu", ["window"], ["pattern"])], "none", *ends)
     with pytest.raises(ExportError, match=r"no convolution .* without --int8"):

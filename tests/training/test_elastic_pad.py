@@ -1,7 +1,6 @@
 """The elastic pad against closed forms, finite elements and itself: layer, contact, friction, magnets, and presses."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import magpylib
 import numpy as np
@@ -130,28 +129,21 @@ def test_a_punch_on_a_thick_layer_is_boussinesqs_and_mindlins():
     # Measured 0.8 % above: cells, and a layer 20 radii thick instead of a half-space.
     expected_n = 4 * layer.shear_modulus_mpa * radius * 0.1 / (1 - layer.poisson)
     assert pressure.sum(dtype=float) * cell_mm**2 == pytest.approx(expected_n, rel=0.02)
-    pushed = push(
-        FrictionSolver(layer, size, cell_mm, torch.float64), (shape[0] == 0) * 1.0, (0.1, 0.0), 0.0, 1e6, 1e-4
-    )
+    solver = FrictionSolver(layer, size, cell_mm, torch.float64)
+    *_, force_n = push(solver, (shape[0] == 0) * 1.0, (0.1, 0.0), 0.0, 1e6, 1e-4)
     expected_n = 8 * radius * layer.shear_modulus_mpa / (2 - layer.poisson) * 0.1
-    assert pushed.force_n == pytest.approx((expected_n, 0), rel=0.03, abs=1e-4 * expected_n)
-
-
-class Pushed(NamedTuple):
-    traction_mpa: np.ndarray
-    stick: np.ndarray
-    force_n: np.ndarray
+    assert force_n == pytest.approx((expected_n, 0), rel=0.03, abs=1e-4 * expected_n)
 
 
 def push(solver, pressure, slide_mm, twist_rad, friction, tolerance=1e-5):
-    """One pose."""
+    """Traction in [MPa] of one pose, where it sticks, and the force in [N]."""
     (traction,), (residual,) = solver.solve(
         pressure[None], np.array([slide_mm]), np.array([twist_rad]), np.array([friction]), tolerance=tolerance
     )
     assert residual < 1.01 * tolerance
     traction = traction.astype(float)
     stick = (pressure > 0) & (np.hypot(*traction) < (1 - 1e-4) * friction * pressure)
-    return Pushed(traction, stick, traction.sum(axis=(1, 2)) * solver.cell_mm**2)
+    return traction, stick, traction.sum(axis=(1, 2)) * solver.cell_mm**2
 
 
 def test_the_law_of_friction_holds():
@@ -200,57 +192,34 @@ def test_a_magnet_near_its_chip_or_through_it_is_refused():
             array.change_mt(movement)
 
 
-PIXEL_MM = USPA44.pitch_mm / TRACTION_SCALE
-
-
 @pytest.fixture(scope="module")
 def pad():
     return GrippedPad(NOMINAL)
 
 
-PLACED = Pose(0.5, -0.5, 20.0)
-
-
-def figure(pad, name="C", pose=PLACED):
-    """Heights of a figure under the pad, (1, m, m) in [mm]."""
-    return heights_of(name, pose, pad)[None]
-
-
-def face(pad):
-    return np.zeros((1, *np.broadcast_shapes(*(places.shape for places in pad.places_mm))), np.float32)
-
-
-def press(pad, heights_mm, depth_mm=0.2, slide_mm=(0.0, 0.0), twist_rad=0.0, friction=0.5, cover=BARE, **options):
-    """One press."""
-    return pad.press(
-        heights_mm,
-        np.array([depth_mm]),
-        np.array([slide_mm]),
-        np.array([twist_rad]),
-        np.array([friction]),
-        [cover],
-        **options,
-    )
+def press(pad, heights_mm, depth_mm=0.2, slide_mm=(0.0, 0.0), twist_rad=0.0, friction=0.5, **options):
+    depth, slide, twist, mu = (np.array([value]) for value in (depth_mm, slide_mm, twist_rad, friction))
+    return pad.press(heights_mm, depth, slide, twist, mu, [BARE], **options)
 
 
 @pytest.mark.parametrize(("slide_mm", "twist_rad"), [((0.1, 0.0), 0.0), ((0.0, -0.3), 0.0), ((0.05, 0.1), 0.03)])
 def test_traction_adds_up_to_force_and_twist(pad, slide_mm, twist_rad):
-    done = press(pad, figure(pad), 0.3, slide_mm, twist_rad, friction=0.6)
-    added_n = done.traction_kpa[0].sum(axis=(1, 2)) * 1e-3 * PIXEL_MM**2
+    pixel_mm = USPA44.pitch_mm / TRACTION_SCALE
+    done = press(pad, heights_of("C", Pose(0.5, -0.5, 20.0), pad)[None], 0.3, slide_mm, twist_rad, friction=0.6)
+    added_n = done.traction_kpa[0].sum(axis=(1, 2)) * 1e-3 * pixel_mm**2
     assert added_n == pytest.approx(done.force_n[0], rel=1e-4, abs=1e-5)
-    across_mm = (np.arange(8) - 3.5) * PIXEL_MM
+    across_mm = (np.arange(8) - 3.5) * pixel_mm
     x_kpa, y_kpa, _ = done.traction_kpa[0]
-    twist = float((y_kpa * across_mm - x_kpa * across_mm[:, None]).sum() * 1e-3 * PIXEL_MM**2)
+    twist = float((y_kpa * across_mm - x_kpa * across_mm[:, None]).sum() * 1e-3 * pixel_mm**2)
     # Coarse pixels know no arm within themselves: off by 5 % of force times the pixel, measured.
-    most = 0.08 * float(np.abs(done.force_n[0, :2]).max()) * PIXEL_MM
+    most = 0.08 * float(np.abs(done.force_n[0, :2]).max()) * pixel_mm
     assert twist == pytest.approx(float(done.twist_nmm[0]), abs=most + 1e-3)
     assert np.abs(done.force_n[0, :2]).max() > 0.1 or abs(done.twist_nmm[0]) > 1, "it is dragged"
 
 
 @pytest.mark.parametrize("name", ["C", "O"])
 def test_every_frame_of_a_whole_tap_is_a_press_of_its_depth(pad, name):
-    pose = Pose(1.0, -0.5, 30.0)
-    heights = figure(pad, name, pose)
+    heights = heights_of(name, Pose(1.0, -0.5, 30.0), pad)[None]
     tap = pad.tap(heights, 5.0)
     assert tap.indentation_mm[0] == pytest.approx(tap.indentation_mm[0, -1] * np.arange(1, FRAMES + 1) / FRAMES)
     reached = tap.force_n[0, -1] == pytest.approx(5.0, rel=1e-3)
@@ -269,16 +238,14 @@ def test_every_frame_of_a_whole_tap_is_a_press_of_its_depth(pad, name):
 
 def test_a_press_that_takes_too_much_force_goes_less_deep():
     stiff = GrippedPad(replace(NOMINAL, thickness_mm=3.6, shear_modulus_mpa=0.15))
-    free = stiff.tap(face(stiff), 1e3)
-    held = press(stiff, face(stiff), 0.5)
+    face = np.zeros((1, *(stiff.places_mm[0] + stiff.places_mm[1]).shape), np.float32)
+    free = stiff.tap(face, 1e3)
+    held = press(stiff, face, 0.5)
     assert free.force_n[0, -1] > 1.3 * MOST_FORCE_N
     assert 0.7 * MOST_FORCE_N < held.force_n[0, 2] <= MOST_FORCE_N
     assert held.indentation_mm[0] < free.indentation_mm[0, -1] == 0.5
     assert held.patterns.max() == pytest.approx(held.indentation_mm[0], rel=1e-4)
-    light = press(stiff, face(stiff), 0.1)
+    light = press(stiff, face, 0.1)
     assert light.indentation_mm[0] == pytest.approx(0.1) and light.force_n[0, 2] < MOST_FORCE_N
-
-
-def test_nothing_under_the_pad_is_refused(pad):
     with pytest.raises(SurfaceError, match="nothing lies under the pad"):
-        press(pad, np.full_like(face(pad), NOWHERE_MM))
+        press(stiff, np.full_like(face, NOWHERE_MM))

@@ -7,12 +7,6 @@ from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.fem_reference import FemPad, NoEquilibriumError
 
-NOTHING_MM = 1e3
-
-
-def disc(along_mm, radius_mm):
-    return np.where(np.hypot(along_mm[:, None], along_mm[None, :]) <= radius_mm, 0.0, NOTHING_MM)
-
 
 def bowl(along_mm, radius_mm):
     return (along_mm[:, None] ** 2 + along_mm[None, :] ** 2) / (2 * radius_mm)
@@ -57,5 +51,6 @@ def test_at_small_strain_it_is_the_layer(thickness_mm, poisson):
 
 def test_a_leap_too_far_is_named():
     pad = FemPad(3, 2, Layer())
+    disc = np.where(np.hypot(pad.nodes_mm[:, None], pad.nodes_mm) <= 3.0, 0.0, 1e3)
     with pytest.raises(NoEquilibriumError, match=r"at an indentation of 4\.4 mm; press in other steps"):
-        pad.press(disc(pad.nodes_mm, 3.0), np.array([0.1, 4.4]))
+        pad.press(disc, np.array([0.1, 4.4]))

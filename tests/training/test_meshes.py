@@ -5,11 +5,10 @@ import trimesh
 from train.errors import MeshError
 from train.surfaces.meshes import MAX_FILE_BYTES, load_mesh
 
-BOX_MM = (10.0, 8.0, 3.0)
 AT_REST = [-5, -4, -3, 5, 4, 0]
 
 
-def box(extents=BOX_MM, at=(20.0, -7.0, 11.0)):
+def box(extents=(10.0, 8.0, 3.0), at=(20.0, -7.0, 11.0)):
     return trimesh.creation.box(extents).apply_translation(at)
 
 

@@ -10,7 +10,7 @@ from edge_samples import make_pad_contract
 from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.scans.pad_constants import Pad as KnownPad
 from train.physics.pad_draws import INPUTS, KNOWN, RANGES, Pad, constants, draw_pad, input_scale, known_numbers
-from train.physics.sensor_noise import NAMES, Nuisances, apply_nuisances, frame_weights
+from train.physics.sensor_noise import NAMES, Nuisances, apply_nuisances
 
 NONE = Nuisances().without(*NAMES)
 STRONG = Nuisances(
@@ -28,10 +28,6 @@ ACTING = tuple(name for name in NAMES if not name.startswith("pose"))
 ANGLES_DEG = np.array([0.0, 5.0, 90.0])
 
 
-def alone(nuisances, name):
-    return replace(NONE, **{name: getattr(nuisances, name)})
-
-
 def presses(n=5, taps=3, frames=8, counts=1e5):
     peak = np.random.default_rng(1).uniform(-counts, 3 * counts, (n, taps, 1, 3, 4, 4))
     return (peak * np.linspace(1 / frames, 1, frames)[:, None, None, None] ** 1.5).astype(np.float32)
@@ -44,7 +40,8 @@ def test_each_acts_by_itself_and_in_its_turn(off):
     together = apply_nuisances(presses(), nuisances, 7, angle_deg=ANGLES_DEG)
     in_turn = presses()
     for name in ACTING:
-        in_turn = apply_nuisances(in_turn, alone(nuisances, name), 7, angle_deg=ANGLES_DEG)
+        alone = replace(NONE, **{name: getattr(nuisances, name)})
+        in_turn = apply_nuisances(in_turn, alone, 7, angle_deg=ANGLES_DEG)
     assert np.abs(together - in_turn).max() <= 4
     changed = np.abs(together - apply_nuisances(presses(), STRONG, 7, angle_deg=ANGLES_DEG)).max()
     assert (changed > 100) == (off is not None)
@@ -58,28 +55,6 @@ def test_all_off_only_rounds_and_leaves_its_input_alone():
     assert np.array_equal(clean, kept)
     assert readings.dtype == np.float32
     assert np.array_equal(readings, np.rint(readings))
-
-
-def maxwell(readings, time_s, share, relaxation_s):
-    """Apply hysteresis step by step; the update is exact for readings linear in time, and q begins in equilibrium."""
-    steps = np.maximum(np.diff(time_s) / relaxation_s, 1e-12)
-    keep, mean = np.exp(-steps), -np.expm1(-steps) / steps
-    lagging = np.array(readings, dtype=np.float64)
-    for now in range(1, len(lagging)):
-        k, m = keep[now - 1], mean[now - 1]
-        lagging[now] = k * lagging[now - 1] + (m - k) * readings[now - 1] + (1 - m) * readings[now]
-    return (1 - share) * readings + share * lagging
-
-
-@pytest.mark.parametrize("relaxation", [1e-9, 0.05, 1.0, 30.0, 1e9])
-def test_closed_form_and_steps_are_the_same_hysteresis(relaxation):
-    rng = np.random.default_rng(0)
-    frames, step_s, share = 16, 0.07, 0.3
-    press = rng.normal(size=(frames, 5))
-    weights = frame_weights(frames, np.array([[step_s]]), np.array([share]), np.array([relaxation]))
-    course = np.concatenate([np.zeros((1, 5)), press])
-    stepped = maxwell(course, np.arange(frames + 1) * step_s, share, relaxation)
-    assert np.allclose(weights[0, 0] @ press, stepped[1:], atol=1e-5)
 
 
 @pytest.mark.parametrize("gains", [None, (1.0,) * 48])

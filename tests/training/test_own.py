@@ -84,15 +84,16 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     assert objection is not None and "on figures it is -" in objection and "to stsr-int8" in objection
     losing = "on 100% of the pads that this may be, expected at most 20%: train on taps of the sensor"
     assert f"below stsr-int8 {losing} (train.taps)" in objection
-    tapped = compared(tiny, found, sets | {TAPPED: sets["figures"]}, []).objection
+    bundled = ModelSession(find_model("stsr-int8"))
+    tapped = compared(tiny, found, sets | {TAPPED: sets["figures"]}, [], {"mine": bundled}).objection
     assert tapped is not None and f"on {TAPPED} it is -" in tapped and "the pads" not in tapped, "of this one alone"
+    assert tapped.count("to mine") == 1, "own taps decide between further models"
     _, objection, _ = compared(tiny, Knowledge("any", Pad(), RANGES), sets, [])
     assert "expected at most 20%" in objection and "train.taps" not in objection, "of a model for any sensor"
     rest = Baseline.from_counts("xela_4", np.full((2, 3, 4, 4), 30_000), created_unix_s=0.0)
     free = Grip("untouched", np.full((30, 3, 4, 4), 30_000), rest)
     _, objection, _ = compared(tiny, found, sets, [free])
     assert "in untouched nan% of its patterns have holes" in objection, "no pattern is no proof"
-    bundled = ModelSession(find_model("stsr-int8"))
     _, objection, _ = compared(bundled, found, sets, [])
     assert objection is not None and UNLIKE not in objection, "no worse there"
     _, objection, _ = compared(tiny, found, sets, [], {REPLACED: bundled})

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import shapely
 from bridge_samples import write_npz
-from edge_samples import make_contract, write_model
 from matplotlib.image import imsave
 from press_samples import make_press_set
 from tapping_robot import Robot, grid_places_mm, plate_mesh
@@ -22,7 +21,7 @@ from train.data.presses import load_presses
 from train.data.recorded_taps import image_surface, load_tap_parts, surface_of
 from train.errors import DatasetError
 from train.networks.compact import HeteroscedasticError
-from train.own import OWN, TAPPED, compared, knowledge_of
+from train.own import TAPPED, knowledge_of
 from train.physics.gripped import FINE_SCALE, GrippedPad
 from train.physics.pad_draws import KNOWN, NOMINAL, constants
 from train.physics.tpsf import resample
@@ -63,6 +62,9 @@ def test_taps_become_a_set_with_truth(tapped, capsys):
     made = load_presses(folder / "taps.npz")
     split = {name: len(numbers) for name, numbers in made.config["split"].items()}
     assert split == {"training": 21, "validation": 3, "test": 3}, "a ninth of the places, twice"
+    found = knowledge_of(load_sensor_file(folder / "sensor.toml"), None)
+    parts = load_tap_parts(folder / "taps.npz", "4", found.pad, constants(found.middle()))
+    assert {name: len(np.unique(part.pad)) for name, part in parts.items()} == split
     last = np.append(np.flatnonzero(np.diff(made.pad)), len(made) - 1)
     assert len(last) == 27 and np.diff(last).max() == 16, "from first touch to full force"
     expected = resample(truth.unit_patterns, FINE_SCALE, 10) * truth.indentation_mm[:, None, None]
@@ -216,20 +218,6 @@ def test_a_third_of_a_batch_are_own_taps_as_they_are():
         return pattern, batch.pattern + 1, batch.traction.nan_to_num(0)
 
     assert np.isfinite(HeteroscedasticError().loss(net, batch).item())
-
-
-def test_what_loses_on_own_taps_is_not_handed_over(tapped, tmp_path):
-    folder, _ = tapped
-    taps.main(arguments(folder))
-    found = knowledge_of(load_sensor_file(folder / "sensor.toml"), None)
-    parts = load_tap_parts(folder / "taps.npz", "4", found.pad, constants(found.middle()))
-    assert set(parts) == {"training", "validation", "test"} and len(np.unique(parts["test"].pad)) == 3
-    tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
-    bundled = ModelSession(find_model("stsr-int8"))
-    table, objection, _ = compared(tiny, found, {TAPPED: parts["test"]}, [], {bundled.name: bundled})
-    assert OWN in table and objection is not None and f"on {TAPPED} it is -" in objection
-    _, objection, _ = compared(bundled, found, {TAPPED: parts["test"]}, [], {"tiny": tiny})
-    assert objection is not None and "to tiny" not in objection, "better than tiny, and no better than itself"
 
 
 def test_taps_of_another_sensor_or_of_none_are_refused(tapped, tmp_path):

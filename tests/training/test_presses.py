@@ -90,11 +90,6 @@ def presses():
     return make_press_set(count=64, taps=2)
 
 
-def counts_of(batch):
-    """Newest taps of a batch, (n, 3, rows, cols) in counts."""
-    return batch.window[:, :3].numpy() * np.asarray(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
-
-
 def test_half_of_the_windows_of_one_tap_are_mirror_images(presses):
     batch = PressBatches(presses, (1.0,), 64, seed=7, nuisances=QUIET)(0)
     sums = presses.traction_kpa.astype(np.float32).sum(axis=(2, 3))[:, 1:]  # no mirror changes those of y and z
@@ -102,10 +97,11 @@ def test_half_of_the_windows_of_one_tap_are_mirror_images(presses):
     own = presses.pick(index)
     mirrored = (batch.traction.numpy() != own.traction_kpa.astype(np.float32)).any(axis=(1, 2, 3))
     assert sorted(index) == list(range(64)) and 0.3 < mirrored.mean() < 0.7
+    units = np.asarray(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
     signs = np.where(mirrored[:, None], (-1, 1, 1), 1)[..., None, None]
     for found, expected, within in (
         (batch.traction.numpy(), own.traction_kpa, 0.01),
-        (counts_of(batch), own.counts[:, 0], 0.51),
+        (batch.window.numpy() * units, own.counts[:, 0], 0.51),
     ):
         image = np.where(mirrored[:, None, None, None], expected[..., ::-1], expected) * signs
         assert np.abs(found - image)[batch.pad[:, -1].numpy() == 0].max() <= within

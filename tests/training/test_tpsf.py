@@ -15,7 +15,6 @@ from train.surfaces.poses import random_poses
 
 PIXEL_MM = 0.47
 SIDE = 42
-PLACE_MM = (np.arange(SIDE) - (SIDE - 1) / 2) * PIXEL_MM
 
 
 def direct(maps, beta_mm):
@@ -69,7 +68,8 @@ def test_the_default_kernel_is_the_layers():
 
 @pytest.mark.filterwarnings("error")
 def test_no_contact_and_an_impossible_one_stay_finite():
-    square = PLACE_MM[:, None] ** 2 + PLACE_MM**2
+    place_mm = (np.arange(SIDE) - (SIDE - 1) / 2) * PIXEL_MM
+    square = place_mm[:, None] ** 2 + place_mm**2
     depth = np.stack([np.where(square < 25, 5 - np.sqrt(np.maximum(25 - square, 0)), 1e3)] * 3)  # a ball
     touching = np.stack([depth[0] < 0.1, np.zeros((SIDE, SIDE), bool), depth[0] < 1.0])
     pattern = heights_pattern(depth, touching, np.array([0.0, 0.3, 0.2]), PIXEL_MM)
@@ -87,20 +87,6 @@ def test_resampling_keeps_mean_and_constants(scale):
     assert np.allclose(resample(np.full((1, 80, 80), 0.3), 20, scale), 0.3)
 
 
-def synthetic(count):
-    """Scans of rectangles under a sensor that is the model itself: any alpha, one beta and one gamma."""
-    rng, depth = np.random.default_rng(0), torch.zeros(count, 40, 40)
-    for image in depth:
-        top, left = rng.integers(0, 20, 2)
-        height, width = rng.integers(5, 20, 2)
-        image[top : top + height, left : left + width] = 1.0
-    alpha = torch.from_numpy(np.random.default_rng(1).uniform(0.1, 0.5, count)).float()
-    pattern = tpsf(depth, alpha, torch.ones(1), PIXEL_MM)
-    counts = torch.zeros(count, 3, 4, 4)
-    counts[:, 2] = 100.0 * degrade(pattern, torch.tensor(1.2))
-    return counts.numpy(), depth.numpy(), 0.3 * pattern.amax(dim=(1, 2)).numpy()
-
-
 def test_degradation_is_equations_7_and_8():
     pattern = torch.from_numpy(np.random.default_rng(0).random((1, 16, 16))).double()
     pixel_mm, gamma = USPA44.pitch_mm / 4, 1.1
@@ -113,7 +99,17 @@ def test_degradation_is_equations_7_and_8():
 
 
 def test_training_finds_patterns_of_a_sensor_like_the_model():
-    counts, depth, press = synthetic(192)
+    """Scans of 192 rectangles under a sensor that is the model itself: any alpha, one beta and one gamma."""
+    rng, depth = np.random.default_rng(0), torch.zeros(192, 40, 40)
+    for image in depth:
+        top, left = rng.integers(0, 20, 2)
+        height, width = rng.integers(5, 20, 2)
+        image[top : top + height, left : left + width] = 1.0
+    alpha = torch.from_numpy(np.random.default_rng(1).uniform(0.1, 0.5, 192)).float()
+    pattern = tpsf(depth, alpha, torch.ones(1), PIXEL_MM)
+    counts = np.zeros((192, 3, 4, 4), np.float32)
+    counts[:, 2] = 100.0 * degrade(pattern, torch.tensor(1.2)).numpy()
+    depth, press = depth.numpy(), 0.3 * pattern.amax(dim=(1, 2)).numpy()
     net, again = PsfNet(), PsfNet()
     losses = fit_psf_net(net, counts, depth, press, epochs=60)
     assert losses[-1] < 0.1 * losses[0]

@@ -13,12 +13,13 @@ from edge.evaluation.metrics import psnr_db
 from train.data.frozen_presses import freeze_presses
 from train.data.press_batches import Batch
 from train.data.presses import SEED
-from train.errors import CheckpointError, DatasetError
-from train.fit import bundled, main
+from train.errors import CheckpointError
+from train.fit import main
 from train.learning.checkpoint import Training, fit_network, infer, load_network
 from train.learning.interval_fit import interval_coverage
 from train.learning.training_loop import DivergedError, Recipe, learning_rate_share, train
 from train.networks.blocks import PatternNet, RelativeError
+from train.networks.published import SrganObjective
 from train.physics.pad_draws import KNOWN
 
 SMALL = {"channels": 16, "blocks": 1, "known": KNOWN}
@@ -110,12 +111,6 @@ def test_a_training_begins_with_the_weights_of_another(folder, data, validation,
     assert all(torch.allclose(first[name], further[name]) for name in first if name != "deviation_scale")
 
 
-def test_the_bundled_networks_need_presses_of_seven_taps(data):
-    assert [one.name for one in bundled(make_press_set(taps=7))] == ["stsr", "stsr-small", "mtsr"]
-    with pytest.raises(DatasetError, match="at most 2 taps, the bundled networks take 7"):
-        bundled(data)
-
-
 def test_one_network_by_the_command(data, tmp_path, capsys):
     data.save(tmp_path / "data.npz")
     files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / "data.npz")]
@@ -125,42 +120,38 @@ def test_one_network_by_the_command(data, tmp_path, capsys):
     assert load_network(tmp_path / "fusion-mtsr2.pt")[1]["config"]["recipe"]["bf16"] is True
 
 
+FUSION = ["--network", "fusion-mtsr2"]
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [
         (["--data", "absent.npz"], "no such file"),
+        ([], "at most 2 taps, the bundled networks take 7"),
         (["--network", "mtsr4"], "no sequences of 4 taps"),
         (["--network", "fusion-mtsr4"], "no sequences of 3 taps"),
         (["--network", "compact-stsr", "--start-from", "absent"], "absent.pt"),
+        (
+            [*FUSION, "--validation", "single.npz"],
+            "the validation set .*has 48 sequences of 1 taps that are only turned, .*; expected some of 2 taps, at x10",
+        ),
+        ([*FUSION, "--validation", "moved.npz"], "the validation set .*has 0 sequences of 2 taps that are only turned"),
+        (
+            [*FUSION, "--validation", "coarse.npz"],
+            "the validation set .*at x2 of 4 x 4 taxels; expected some of 2 taps, at x10 of 4 x 4",
+        ),
+        ([*FUSION, "--data", "data.npz", "coarse.npz"], "the presses are at x10 of 4 x 4 taxels and x2 of 4 x 4"),
     ],
 )
-def test_what_cannot_be_trained_is_said_in_one_line(data, tmp_path, options, told):
-    data.save(tmp_path / "data.npz")
-    given = [] if "--data" in options else ["--data", str(tmp_path / "data.npz")]
-    given += ["--validation", str(tmp_path / "data.npz")]
-    with pytest.raises(SystemExit, match=rf"^fit: .*{told}[^\n]*$"):
-        main([str(tmp_path), *given, *options, "--steps", "1"])
-
-
-def test_presses_that_do_not_belong_together_are_refused_first(data, tmp_path):
+def test_what_cannot_be_trained_is_said_in_one_line(data, tmp_path, monkeypatch, options, told):
+    monkeypatch.chdir(tmp_path)
     data.save(tmp_path / "data.npz")
     coarse = {name: getattr(data, name)[:, ::5, ::5] for name in ("patterns", "touching")}
     replace(data, **coarse).save(tmp_path / "coarse.npz")
     data.with_taps(1).save(tmp_path / "single.npz")
     replace(data, poses=data.poses + 1).save(tmp_path / "moved.npz")
-    refused = {
-        "single": r"has 48 sequences of 1 taps that are only turned, .*; expected some of 2 taps, at x10 of 4 x 4 as",
-        "moved": "has 0 sequences of 2 taps that are only turned",
-        "coarse": "at x2 of 4 x 4 taxels; expected some of 2 taps, at x10 of 4 x 4",
-    }
-    options = ["--network", "fusion-mtsr2", "--steps", "1"]
-    for name, told in refused.items():
-        files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / f"{name}.npz")]
-        with pytest.raises(SystemExit, match=rf"^fit: the validation set [^\n]*{told}[^\n]*$"):
-            main([str(tmp_path), *files, *options])
-    files = ["--data", str(tmp_path / "data.npz"), str(tmp_path / "coarse.npz"), "--validation", files[-1]]
-    with pytest.raises(SystemExit, match=r"^fit: the presses are at x10 of 4 x 4 taxels and x2 of 4 x 4 taxels, .*$"):
-        main([str(tmp_path), *files, *options])
+    with pytest.raises(SystemExit, match=rf"^fit: [^\n]*{told}[^\n]*$"):
+        main([".", "--data", "data.npz", "--validation", "data.npz", "--steps", "1", *options])
 
 
 def test_a_full_disk_is_one_line(data, tmp_path):
@@ -204,12 +195,6 @@ def weights(net):
     return torch.cat([value.flatten() for value in net.state_dict().values()])
 
 
-def trained(tmp_path, recipe=RECIPE, **options):
-    net = new_net()
-    train(net, RelativeError(), batches, recipe, tmp_path / "net.resume", **options)
-    return net
-
-
 def test_the_rate_rises_for_a_tenth_and_falls_to_nothing():
     for wrong in ({"steps": 0}, {"batch": 0}, {"learning_rate": -1.0}):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*, expected more than 0"):
@@ -221,7 +206,8 @@ def test_the_rate_rises_for_a_tenth_and_falls_to_nothing():
 
 @pytest.mark.parametrize("killed_at", [1, 7, 11])
 def test_a_run_that_was_killed_goes_on_as_if_it_were_not(tmp_path, killed_at):
-    whole, seen = trained(tmp_path), []
+    """With the objective that has weights and draws of its own."""
+    seen = []
 
     def until_killed(number):
         if number == killed_at:
@@ -232,20 +218,23 @@ def test_a_run_that_was_killed_goes_on_as_if_it_were_not(tmp_path, killed_at):
         seen.append(number)
         return batches(number)
 
+    whole = new_net()
+    train(whole, SrganObjective(seed=3), batches, RECIPE, tmp_path / "whole.resume")
     with pytest.raises(InterruptedError):
-        train(new_net(), RelativeError(), until_killed, RECIPE, tmp_path / "net.resume", keep_every_s=-1.0)
+        train(new_net(), SrganObjective(seed=3), until_killed, RECIPE, tmp_path / "net.resume", keep_every_s=-1.0)
     torch.manual_seed(99)
     resumed = Map()
-    _, course = train(resumed, RelativeError(), recorded, RECIPE, tmp_path / "net.resume")
+    _, course = train(resumed, SrganObjective(seed=8), recorded, RECIPE, tmp_path / "net.resume")
     assert seen == list(range(killed_at, 12)) and [*course] == list(range(1, 13))
     assert torch.equal(weights(whole), weights(resumed))
 
 
 @pytest.mark.parametrize(("steps", "identity"), [(13, "these data"), (12, "others")])
 def test_a_run_of_another_recipe_is_not_continued(tmp_path, steps, identity):
-    trained(tmp_path, identity="these data", keep_every_s=-1.0)
+    net, objective, path = new_net(), RelativeError(), tmp_path / "net.resume"
+    train(net, objective, batches, RECIPE, path, identity="these data", keep_every_s=-1.0)
     with pytest.raises(CheckpointError, match="delete it"):
-        trained(tmp_path, replace(RECIPE, steps=steps), identity=identity)
+        train(net, objective, batches, replace(RECIPE, steps=steps), path, identity=identity)
 
 
 def test_a_loss_that_is_no_number_ends_the_run_before_its_step(tmp_path):
