@@ -11,8 +11,8 @@
 #include <time.h>
 #include <zlib.h>
 
-/* Copies the newest result of a sensor; 1 if there is one that is young and of a device, or one is to pretend so. Give
-   `half` room for half_bytes, header[3] below. */
+/* Copies the newest result of a sensor; 1 if there is one that is young, whose baseline is not in doubt (state 6), and
+   that is of a device, or one is to pretend so. Give `half` room for half_bytes, header[3] below. */
 static int latest(const uint8_t *memory, const char *sensor, int64_t oldest_ns, int pretend, uint8_t *half) {
     uint32_t header[5]; /* header_bytes, slots, slot_bytes, half_bytes, first_half_at */
     memcpy(header, memory + 12, sizeof header);
@@ -29,12 +29,13 @@ static int latest(const uint8_t *memory, const char *sensor, int64_t oldest_ns, 
             if (strncmp((const char *)half + 184, sensor, 256) != 0) break;
             struct timespec now;
             int64_t time_ns;
-            int32_t source;
+            int32_t source, state;
             clock_gettime(CLOCK_MONOTONIC, &now);
             memcpy(&time_ns, half + 16, 8);
             memcpy(&source, half + 48, 4);
+            memcpy(&state, half + 52, 4);
             int64_t age_ns = now.tv_sec * INT64_C(1000000000) + now.tv_nsec - time_ns;
-            return age_ns >= 0 && age_ns < oldest_ns && (source == 1 || pretend);
+            return age_ns >= 0 && age_ns < oldest_ns && state != 6 && (source == 1 || pretend);
         }
     }
     return 0;

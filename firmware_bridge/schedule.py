@@ -10,6 +10,7 @@ from typing import Final
 
 LAST_TIME_NS: Final = 1 << 60  # latest time in a recording, in [ns] (36 years): sums of two times stay below 2^63
 NS_PER_S: Final = 1_000_000_000
+RATE_HZ: Final = 100.0  # of a uSPa44: at which run times are measured, and demos are made
 POSITIVE: Final = (1e-9, 1e9)  # positive numbers that a user may give: others have no use, and no room in nanoseconds
 
 Clock = Callable[[], int]  # clock of monotonic time, in [ns]

@@ -14,6 +14,7 @@ from edge.cli.demo import Scene
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
+from firmware_bridge.schedule import RATE_HZ
 from train.data.presses import SEED
 from train.families.catalogue import tap
 from train.physics.contact import BARE
@@ -32,7 +33,6 @@ _PLACE_MM: Final = PLACES_MM["test"]
 ANGLE_DEG: Final = 30.0  # angle of the last scored tap; each tap before is a step back, each later one a step on
 TAPS: Final = 4
 FORCE_N: Final = 5.0
-RATE_HZ: Final = 100.0
 REST_FRAMES, PRESS_FRAMES, HOLD_FRAMES, LIFT_FRAMES, GAP_FRAMES, STILL_FRAMES = 150, 20, 24, 12, 24, 30
 TAP_FRAMES: Final = PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES + GAP_FRAMES
 MAGNET_FRAMES, MAGNET_ALONE_FRAMES = 80, 30  # in which it comes, and leaves; for which it stays before a tap

@@ -20,9 +20,9 @@ from edge.bench.subjects import (
     error_rows,
     subjects,
 )
-from edge.bench.timing import RATE_HZ
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
+from firmware_bridge.schedule import RATE_HZ
 
 _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
 

@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from edge.errors import EdgeError
 from edge.evaluation.test_set import load_frozen_set
 from firmware_bridge.schedule import Clock, Sleep, Ticker
 
-RATE_HZ: Final = 100.0  # of a sensor, at which run times are measured
 Run = Callable[[int], object]  # one inference; its argument is a number that selects the input
 
 

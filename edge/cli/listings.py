@@ -8,12 +8,11 @@ from typing import Final, TextIO
 import numpy as np
 
 from edge.api import DEFAULT_MODEL, POSED_MODEL, Model, ModelError, bundled_models, load_model
-from edge.bench.timing import RATE_HZ
 from edge.terminal.argument_types import columns, wrapped
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.errors import DeviceError, as_typed
 from firmware_bridge.links.discovery import Found, devices
-from firmware_bridge.schedule import Ticker
+from firmware_bridge.schedule import RATE_HZ, Ticker
 
 TICKS: Final = 150
 

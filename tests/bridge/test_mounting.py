@@ -92,7 +92,7 @@ def test_a_map_in_place_and_a_scan_put_in_place_agree(mounting):
 
 @settings(max_examples=20, deadline=None)
 @given(mountings)
-def test_what_the_vendors_server_says_lies_and_points_as_the_pad_does(mounting):
+def test_the_vendors_readings_lie_and_point_as_the_pad_does(mounting):
     newtons = np.random.default_rng(1).normal(0, 1, 48).tolist()
     entry = sensor_entry(calibrated=newtons, temp=[300.0 + n for n in range(16)], ups=[80.0 + n for n in range(16)])
     text = message(1, entry, sensor_entry())

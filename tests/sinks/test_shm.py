@@ -165,6 +165,7 @@ class TestLayout:
         assert any(read("4", 7, "pretend") == told for _ in range(20))  # where the processor is free within 50 ms
         assert any(read("4", 7, source="device") == told for _ in range(20))
         assert read("4", 9) == (1, "")  # emulated
+        assert read("4", 9, source="device", state="baseline_in_doubt", trusted=False) == (1, "")
         assert read("4", 10, age_ns=50_000_000, source="device") == (1, "")
         assert read("4", 11, age_ns=-60_000_000_000, source="device") == (1, "")
 
