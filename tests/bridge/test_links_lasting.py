@@ -148,6 +148,11 @@ def test_an_error_of_any_class_is_a_loss_and_it_is_opened_again(error):
     assert notices[0].text.startswith(told) and "\n" not in notices[0].text
 
 
+def test_the_first_opening_must_succeed():
+    with pytest.raises(DeviceError, match="no such port"):
+        lasting(World(away=[(0.0, 1.0)]), 1.0)
+
+
 def test_trouble_is_told_twice_and_lost_stamps_once():
     world, notices = World(), []
     with reader_of(world) as link:

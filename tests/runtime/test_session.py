@@ -38,6 +38,18 @@ def test_runs_what_the_graph_says_newest_tap_first(tmp_path, taps):
     np.testing.assert_array_equal(session.run(np.asfortranarray(window)), kept)
 
 
+def test_windows_run_together_give_what_each_gives_alone(tmp_path):
+    session = ModelSession(write_model(tmp_path / "several.onnx", SURE))
+    windows = [random_window(seed) for seed in range(3)]
+    alone = [(session.run(window).copy(), session.deviation.copy()) for window in windows]
+    for count in (3, 1, 2):
+        together = session.run_together(windows[:count])
+        assert together.shape == session.deviation.shape == (count, 40, 40)
+        for index in range(count):
+            np.testing.assert_array_equal(together[index], alone[index][0])
+            np.testing.assert_array_equal(session.deviation[index], alone[index][1])
+
+
 def test_a_window_not_finite_or_of_another_shape_is_refused(session):
     window = random_window()
     window[3, 1, 2, 2] = np.inf

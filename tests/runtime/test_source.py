@@ -114,6 +114,24 @@ class TestOne:
         assert order(taken) == given and source.overruns + len(taken) - 1 == CAPACITY_SCANS + 5
 
 
+class TestScripts:
+    def test_a_link_that_hangs_holds_up_no_other(self):
+        gate = threading.Event()
+        fast = FakeLink([[make_scan(n)] for n in range(5)], prefix="fast/")
+        with Source(FakeLink([gate, [make_scan(0)]], prefix="slow/"), fast) as source:
+            taken = take_all(source, lambda taken: len(taken) >= 5)
+            assert numbers_of(taken, "fast/4") == list(range(5)) and not numbers_of(taken, "slow/4")
+            gate.set()
+            assert numbers_of(take_all(source), "slow/4") == [0]
+
+    def test_the_source_closes_while_a_link_is_away(self):
+        before = set(threading.enumerate())
+        away = FakeLink([], error=LinkLostError("gone"), lasts=True)
+        with Source(away, FakeLink([], endless=True, prefix="right/"), give_up_s=float("inf")) as source:
+            take_all(source, lambda taken: any(isinstance(one, Notice) for one in taken))
+        assert not set(threading.enumerate()) - before
+
+
 def recording(scans, pressed):
     """Two sensors on a bus, which change in every scan, and are pressed at the end."""
     rng = np.random.default_rng(2)
@@ -205,6 +223,15 @@ def test_scans_that_come_during_a_turn_wait_for_the_next():
 
 
 class TestEnds:
+    @pytest.mark.parametrize(
+        ("error", "words"), [(LinkLostError("gone"), "gone"), (ZeroDivisionError(), "unforeseen ZeroDivisionError")]
+    )
+    def test_a_lost_or_faulty_link_is_reported_after_earlier_scans(self, error, words):
+        sink, statistics = ListSink(), Statistics()
+        with pytest.raises(LinkLostError, match=words):
+            pumped(FakeLink([presses([0, 1]), presses([2])], error=error), sink, statistics=statistics)
+        assert numbers(sink) == [0, 1, 2] and statistics.scans == 3
+
     def test_scans_that_wait_at_the_end_have_their_results(self):
         stop, busy = threading.Event(), threading.Event()
         link = FakeLink([presses([0]), busy, presses([1, 2])], endless=True)
