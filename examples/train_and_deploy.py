@@ -35,8 +35,9 @@ from train.data.presses import SEED
 from train.data.world import World
 from train.errors import ended_by_errors
 from train.learning.checkpoint import Training, fit_network
+from train.learning.sensor_knowledge import Knowledge
 from train.learning.training_loop import Recipe
-from train.own import REPLACED, Knowledge, compared, plan_of
+from train.own import REPLACED, compared, plan_of
 from train.physics.pad_draws import KNOWN, RANGES
 from train.surfaces.meshes import mesh_name, size_of
 

@@ -17,115 +17,38 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from edge.evaluation.classical_methods import fitted_methods
+from edge.evaluation.classical_methods import fit_linear_map, fitted_methods
 from edge.evaluation.metrics import psnr_db
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, INT8_SUFFIX, find_model
-from edge.inference.contract import GAINS_CERTAINTY
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.argument_types import positive
 from firmware_bridge.in_place import write_in_place
-from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
-from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file, with_scale
+from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.sensor_file.model import load_sensor_file
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.make_presses import make_presses
 from train.data.press_batches import OneSensor
 from train.data.presses import SEED, PressSet
-from train.data.real_grips import Grip, grips_of, has_hole, play
+from train.data.real_grips import Grip, grips_of, has_hole, hidden_taxels, loaded, play, z_of
 from train.data.recorded_taps import load_tap_parts
 from train.data.world import World, solve_pad
 from train.errors import DatasetError, TrainError, ended_by_errors
 from train.families.catalogue import FIGURES, SHARES
 from train.learning.checkpoint import Training, fit_network
+from train.learning.sensor_knowledge import FIFTH, Knowledge, knowledge_of
 from train.learning.training_loop import Recipe
 from train.physics.gripped import SCALE
-from train.physics.pad_draws import KNOWN, RANGES, SIMULATED, constants
-from train.physics.pad_draws import Pad as SimulatedPad
+from train.physics.pad_draws import KNOWN, constants
 from train.report import Row, bootstrap_interval, markdown
 from train.surfaces.meshes import mesh_name, size_of
-
-_FIFTH: Final = 0.2  # share of a range that a constant without an interval is known to, and by which pads are unlike it
-
-
-@dataclass(frozen=True, slots=True)
-class Knowledge:
-    """Facts of one sensor, and how surely they are known."""
-
-    name: str
-    pad: Pad  # as its sensor file has it, with what was learned and identified
-    ranges: Mapping[str, tuple[float, float]]  # of constants of pads like it
-
-    def sensor(self) -> OneSensor:
-        """Return what a network is told of it."""
-        certainty = self.pad.gains_certainty
-        made_for = {name: self.ranges[name] for name in self.pad.constants}
-        made_for[GAINS_CERTAINTY] = (max(certainty - _FIFTH, 0.0), min(certainty + _FIFTH, 1.0))
-        row = ModelSession(find_model(DEFAULT_MODEL)).contract.pad_row(self.pad)
-        return OneSensor(tuple(row.tolist()), 1 - certainty, made_for)
-
-    def middle(self) -> SimulatedPad:
-        """Return a pad in the middle of the ranges."""
-        return SimulatedPad(**dict[str, Any]({name: sum(ends) / 2 for name, ends in self.ranges.items()}))
-
-    def widened(self) -> Mapping[str, tuple[float, float]]:
-        """Return ranges of pads that lie up to a fifth of a constant's range outside of what is known."""
-        more = {name: _FIFTH * (high - low) for name, (low, high) in RANGES.items()}
-        return {name: _within(name, low - more[name], high + more[name]) for name, (low, high) in self.ranges.items()}
-
-    def told(self) -> str:
-        """Return it in a sentence."""
-        shares = {
-            name: (self.ranges[name][1] - self.ranges[name][0]) / (RANGES[name][1] - RANGES[name][0]) for name in RANGES
-        }
-        known = ", ".join(f"{name} to {share:.0%}" for name, share in shares.items() if share < 1)
-        spread = 100 * GAIN_SPREAD * (1 - self.pad.gains_certainty)
-        gains = f"gains to {spread:.1f} %" if self.pad.gains else "its gains are not known"
-        unknown = [name for name, share in shares.items() if share >= 1]
-        more = f"; not known: {', '.join(unknown)}" if unknown else ""
-        return f"sensor {self.name}: known of the range of its constants: {known or 'nothing'}; {gains}{more}"
-
-
-def _within(name: str, low: float, high: float) -> tuple[float, float]:
-    """Return bounds of a constant that a simulated pad may have."""
-    least, most = SIMULATED[name]
-    return max(low, least), min(high, most)
-
-
-def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
-    """Return what a sensor file tells of a sensor, whose name may be left out of a file of one.
-
-    DatasetError if there is no such sensor, or it is emulated (nothing of it holds for a device) or beyond simulation.
-    """
-    if file.geometry != USPA44:
-        raise DatasetError(f"the sensor file is of a {file.geometry.name}, expected a {USPA44.name}")
-    name = next(iter(file.sensors)) if name is None and len(file.sensors) == 1 else name
-    if name is None or name not in file.sensors:
-        raise DatasetError(f"the sensor file has the sensors {', '.join(file.sensors)}: name one of them with --sensor")
-    entry = file.sensors[name]
-    if entry.emulated:
-        raise DatasetError(
-            f"the sensor file has {', '.join(sorted(entry.emulated))} of an emulated sensor {name}, and no device is "
-            "like it: write one of your sensor with edge-sr doctor --out"
-        )
-    pad = with_scale(entry.used_pad, entry.counts_per_newton, entry.counts_per_newton_interval) or Pad()
-    ranges = dict(RANGES)
-    for constant, value in pad.constants.items():
-        least, most = SIMULATED[constant]
-        if not least <= value <= most:
-            raise DatasetError(
-                f"{constant} of sensor {name} is {value:g}, expected {least:g} to {most:g} of a pad that can be "
-                "simulated: measure it again, or take it out of the sensor file"
-            )
-        apart = _FIFTH * (RANGES[constant][1] - RANGES[constant][0]) / 2
-        ranges[constant] = _within(constant, *pad.intervals.get(constant, (value - apart, value + apart)))
-    return Knowledge(name, pad, ranges)
 
 
 class Plan(NamedTuple):
@@ -187,11 +110,13 @@ def compared(
     over, below = f"over {bundled.name}", "pads below it"
     rows: dict[str, Row] = {name: {"method": name} for name in (*models, "bilinear", over, below)}
     times_us: dict[str, list[float]] = {name: [] for name in models}
-    gains, losing, objections = dict[str, str](), 0.0, list[str]()
+    gains, losing, objections, simulated = dict[str, str](), 0.0, list[str](), list[Any]()
     for what, presses in sets.items():
         as_read = FrozenPresses(presses, np.ones(0, dtype=np.float32))
         frozen = as_read if what == TAPPED else freeze_presses(presses, SEED + 1, sensor.nuisances)
         windows, truth = frozen.windows(1), frozen.patterns()
+        if what != TAPPED:
+            simulated.append((truth.reshape(len(truth), -1), z_of(windows[:, 0])))
         patterns = {name: np.empty_like(truth) for name in models} | {"bilinear": bilinear(windows[:, 0])}
         for number, window in enumerate(windows):
             for name, model in models.items():  # in turn, so that both meet the same machine
@@ -227,6 +152,24 @@ def compared(
                 f"in {grip.trial} {mine:.1%} of its patterns have holes, {theirs:.1%} of {bundled.name}'s: the sensor "
                 "is not as in the sensor file; lay a weight on it with edge-sr doctor"
             )
+    if grips:  # of an operator that reads z off patterns of pads like this one
+        truths, readings = zip(*simulated, strict=True)
+        operator = fit_linear_map(np.concatenate(truths), np.concatenate(readings), 0.1)
+        squares = {
+            name: [_hidden(one, model, knowledge.pad, operator) for one in grips] for name, model in models.items()
+        }
+        recording = np.repeat(np.arange(len(grips)), [len(part) for part in squares[OWN]])
+        off = {name: np.concatenate(parts) for name, parts in squares.items()}
+        worse = off[OWN] - off[bundled.name]
+        known = np.isfinite(worse)
+        for name, values in off.items() if known.any() else ():
+            rows[name]["hidden taxel [counts]"] = f"{np.sqrt(values[known].mean()):.0f}"
+        if known.any() and bootstrap_interval(worse[known], recording[known])[0] > 0:
+            mine, theirs = (rows[name]["hidden taxel [counts]"] for name in (OWN, bundled.name))
+            objections.append(
+                f"of a taxel that is hidden it is {mine} counts off, {bundled.name} {theirs}: the sensor is not as in "
+                "the sensor file"
+            )
     for name, times in times_us.items():
         rows[name]["run time [us]"] = round(float(np.median(times)))
     return Comparison(markdown([*rows.values()]), "; ".join(objections) or None, gains)
@@ -237,6 +180,13 @@ def _holes(grip: Grip, model: ModelSession, pad: Pad) -> float:
     patterns = play(grip, model, pad=pad).patterns
     made = patterns[np.isfinite(patterns).all(axis=(1, 2))]
     return float(has_hole(made).mean()) if len(made) else np.nan
+
+
+def _hidden(grip: Grip, model: ModelSession, pad: Pad, operator: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the mean squared error of the z of taxels, each hidden in turn, of scans (n,); NaN without a pattern."""
+    played = hidden_taxels(grip, model, operator, pad)
+    zeroed = grip.zeroed()
+    return ((played - z_of(zeroed[loaded(zeroed)])) ** 2).mean(axis=1)
 
 
 MOST_LOSING: Final = 0.2  # share of the pads that a sensor may be, its mean over some presses each
@@ -270,7 +220,7 @@ def _train(options: argparse.Namespace) -> None:
         if one.contract.scale != SCALE or (one.contract.taps > 1 and not one.contract.takes_poses):
             got = f"{name} is a model of {one.contract.taps} taps at x{one.contract.scale}"
             raise DatasetError(f"{got}, expected one of a single tap, or of several with poses, at x{SCALE}")
-    if not knowledge.pad.constants and knowledge.pad.gains_certainty < _FIFTH:
+    if not knowledge.pad.constants and knowledge.pad.gains_certainty < FIFTH:
         raise DatasetError(
             "nothing is known of this sensor, and a model for any sensor is there: lay a weight on it with "
             "edge-sr doctor, let edge-sr learn its gains from contacts, or find constants by train.identify"

@@ -240,3 +240,11 @@ def test_files_that_are_no_json_or_not_there(tmp_path, text):
     with pytest.raises(RecordingError, match=words) as refused:
         load_baselines(path)
     assert one_line(refused)
+
+
+def test_a_baseline_of_another_order_of_taxels_is_refused(tmp_path):
+    orders = {"4": tuple(reversed(range(16)))}
+    save_baselines(tmp_path / "zero.json", [made()], orders)
+    assert list(load_baselines(tmp_path / "zero.json", orders)) == ["4"]
+    with pytest.raises(RecordingError, match="the taxels of sensor 4 lay in another order"):
+        load_baselines(tmp_path / "zero.json")

@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.scans.scan_assembler import Readings, ScanAssembler, key
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, MOST_DOUBTS
@@ -164,6 +166,14 @@ def test_cycles_that_wait_for_one_in_time_are_counted():
     assembler = ScanAssembler(USPA44_MAP)
     assert [number for one in [*range(60), *range(61, 66)] for number in play(assembler, one)] == [*range(60), 64, 65]
     assert assembler.counters()["resynchronised"] == 3 * 16
+
+
+def test_a_frame_tells_when_it_was_on_the_bus():
+    assembler, order = ScanAssembler(USPA44_MAP), USPA44_MAP.wire_order("4")
+    frames = [CanFrame(can_id, bytes(8)) for can_id, _ in order]
+    for at_ns, frame in enumerate(frames * 2):  # the device's clock began 1000 ns before the host's
+        scans = assembler.feed_frame(frame, 5000 + at_ns, DeviceTime(host_ns=4000 + at_ns, own_ns=5000 + at_ns))
+    assert [(scan.device_ns, scan.time_ns) for scan in scans] == [(4031, 5031)]
 
 
 def test_a_scan_held_back_when_the_link_broke_never_comes():

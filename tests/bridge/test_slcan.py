@@ -2,6 +2,8 @@
 
 import pytest
 from bridge_samples import decoded
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from firmware_bridge.can.slcan import LINES_TO_LEARN, LONGEST_LINE, CanFrame, SlcanDecoder, encode_frame
 
@@ -18,6 +20,19 @@ def decode(*chunks: bytes) -> tuple[list[CanFrame], dict[str, int]]:
     decoder = SlcanDecoder()
     frames = [frame for chunk in chunks for frame in decoded(decoder, chunk)]
     return frames, {name: count for name, count in decoder.counters().items() if count}
+
+
+LINES = (GOLDEN * 5, OTHER, *STAMPED, b"".join(STAMPED), STAMPED[0] * 3, b"\r", b"\a", b"z\r", b"V1013\r", b"F04\r")
+a_line, a_place = st.sampled_from(LINES), st.integers(0, 30)
+pieces = a_line | st.builds(lambda line, start, end: line[start:end], a_line, a_place, a_place) | st.binary(max_size=40)
+
+
+@given(st.lists(pieces, max_size=30).map(b"".join), st.integers(1, 50))
+@settings(deadline=None, max_examples=300)
+def test_any_chunking_gives_the_same(stream, size):
+    whole = decode(stream)
+    for step in (1, size):
+        assert decode(*(stream[at : at + step] for at in range(0, len(stream), step))) == whole
 
 
 @pytest.mark.parametrize(

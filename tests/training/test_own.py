@@ -19,7 +19,8 @@ from firmware_bridge.zeroing.baseline import Baseline
 from train.data.press_batches import OneSensor, PressBatches
 from train.data.real_grips import Grip
 from train.data.world import World, solve_pad
-from train.own import OWN, REPLACED, TAPPED, UNLIKE, Knowledge, compared, knowledge_of, main
+from train.learning.sensor_knowledge import Knowledge, knowledge_of
+from train.own import OWN, REPLACED, TAPPED, UNLIKE, compared, main
 from train.physics.pad_draws import KNOWN, RANGES
 from train.physics.sensor_noise import NAMES, Nuisances
 
@@ -94,8 +95,12 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     free = Grip("untouched", np.full((30, 3, 4, 4), 30_000), rest)
     _, objection, _ = compared(tiny, found, sets, [free])
     assert "in untouched nan% of its patterns have holes" in objection, "no pattern is no proof"
-    _, objection, _ = compared(bundled, found, sets, [])
-    assert objection is not None and UNLIKE not in objection, "no worse there"
+    counts = [np.full((30, 3, 4, 4), 30_000), 30_000 + sets["figures"].counts[:, 0].round().astype(int)]
+    held = Grip("held", np.concatenate(counts), rest)
+    table, objection, _ = compared(tiny, found, sets, [held])
+    assert "hidden taxel [counts]" in table and "of a taxel that is hidden it is " in objection
+    _, objection, _ = compared(bundled, found, sets, [held])
+    assert objection is not None and not any(word in objection for word in (UNLIKE, "hidden")), "no worse there"
     _, objection, _ = compared(tiny, found, sets, [], {REPLACED: bundled})
     assert objection is not None and objection.count(f"to {REPLACED}") == 1, "the better one stays, by pads like it"
     _, objection, _ = compared(bundled, found, sets, [], {REPLACED: bundled})

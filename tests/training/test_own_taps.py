@@ -20,8 +20,9 @@ from train.data.press_batches import OneSensor, PressBatches, with_own_taps
 from train.data.presses import load_presses
 from train.data.recorded_taps import image_surface, load_tap_parts, surface_of
 from train.errors import DatasetError
+from train.learning.sensor_knowledge import knowledge_of
 from train.networks.compact import HeteroscedasticError
-from train.own import TAPPED, knowledge_of
+from train.own import TAPPED
 from train.physics.gripped import FINE_SCALE, GrippedPad
 from train.physics.pad_draws import KNOWN, NOMINAL, constants
 from train.physics.tpsf import resample

@@ -15,7 +15,7 @@ from edge.inference.onnx_session import ModelSession
 from edge.perception.run_options import ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import load_estimator
-from firmware_bridge.pad_geometry import AXES, USPA44
+from firmware_bridge.pad_geometry import AXES, TAXELS, USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
@@ -48,7 +48,7 @@ class Grip:
 
 def z_of(counts: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return readings of z, (n, taxels), from scans (n, 3, rows, cols)."""
-    return counts[:, _Z].reshape(len(counts), -1)
+    return counts[:, _Z].reshape(-1, TAXELS)
 
 
 def loaded(counts: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -178,6 +178,18 @@ def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | 
     zeroed = grip.zeroed()
     here = loaded(zeroed)
     return Played(zeroed[here], np.stack(patterns)[here], np.array(believed)[here])
+
+
+def hidden_taxels(
+    grip: Grip, model: ModelSession, operator: NDArray[np.floating], pad: Pad | None = None
+) -> NDArray[np.floating]:
+    """Return the z of each taxel, (n, taxels) in counts, as a pattern tells it that was made while it was silent.
+
+    The operator (H * W, taxels) reads z off a pattern; NaN where there was none. Source: Wu and Liu 2024, Eq. 7-8.
+    """
+    shape, silent = model.contract.pattern_shape, (play(grip, model, one, pad).patterns for one in range(TAXELS))
+    readers = operator.T.reshape(TAXELS, *shape)
+    return np.stack([np.tensordot(*parts, axes=2) for parts in zip(silent, readers, strict=True)], axis=1)
 
 
 def share_touched(patterns: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -26,7 +26,8 @@ from train.experiments.workbench import Workbench, infer, name_of
 from train.families.catalogue import BARE, FIGURES, SHARES
 from train.learning.ball_fit import fit_ball
 from train.learning.contact_mixture import learned, place_effects
-from train.own import COMPARED, Knowledge, Plan, compared, knowledge_of, trained
+from train.learning.sensor_knowledge import Knowledge, knowledge_of
+from train.own import COMPARED, Plan, compared, trained
 from train.physics.gripped import MAX_INDENTATION_MM, GrippedPad
 from train.physics.pad_draws import Pad, draw_pad
 from train.physics.sensor_noise import NAMES, Nuisances, apply_nuisances, log_uniform

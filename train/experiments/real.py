@@ -16,10 +16,10 @@ from edge.evaluation.classical_methods import fit_linear_map, fitted_methods
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS_FILE, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.pad_geometry import TAXELS
 from train.data.presses import load_presses
 from train.data.real_grips import (
     has_hole,
+    hidden_taxels,
     neighbours_mean,
     play,
     recorded_grips,
@@ -50,11 +50,7 @@ def real(bench: Workbench, report: Report) -> None:
     played = [(grip, play(grip, model)) for grip in tracked(grips, "whole", "recording")]
     grips, whole = zip(*((grip, one) for grip, one in played if len(one.zeroed)), strict=True)
     z = [z_of(one.zeroed) for one in whole]
-    hidden = [np.full_like(one, np.nan) for one in z]
-    for taxel in tracked(range(TAXELS), "hidden", "taxel"):
-        for grip, estimates in zip(grips, hidden, strict=True):
-            patterns = play(grip, model, taxel).patterns
-            estimates[:, taxel] = patterns.reshape(len(patterns), -1) @ operator[:, taxel]
+    hidden = [hidden_taxels(grip, model, operator) for grip in tracked(grips, "hidden", "recording")]
     bilinear = fitted_methods(bench.use(BUNDLE_DIR / "classical.npz"), SCALE)["bilinear"]
     neighbours = [neighbours_mean(one) for one in z]
     report.say(
