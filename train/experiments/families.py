@@ -33,6 +33,7 @@ from train.physics.pad_draws import INPUTS, NOMINAL, Pad
 from train.physics.sensor_noise import Nuisances
 from train.report import Report, Row, with_interval
 
+TRAINING: Final = World(count=24_000, per_pad=48, seed=67)  # settings of data/gripped.npz in the Makefile
 _LEVELLED: Final = 2000  # training presses by which the level of contact of a baseline is chosen
 _BEST: Final = "linear map"  # of the baselines on validation presses
 _LEVEL: Final = "90"
@@ -45,7 +46,7 @@ def families(bench: Workbench, report: Report) -> None:
     wide = bench.wide_test()
     model = bench.model()
     fitted = fitted_methods(bench.use(BUNDLE_DIR / "classical.npz"), SCALE)
-    training = bench.presses("gripped", World(count=24_000, per_pad=48, seed=67))  # as in the Makefile
+    training = bench.presses("gripped", TRAINING)
     read = read_presses(training.with_taps(1), Nuisances(), SEED)[:, 0]
     baselines = {name: fitted[name] for name in ("bilinear", _BEST)}
     baselines |= {f"nearest {_NEAREST}": nearest_presses(read, training.patterns)}

@@ -32,6 +32,7 @@ from train.learning.checks import magnet_field
 from train.networks.symmetric import symmetries
 from train.report import Report, Row, bootstrap_interval
 
+JUDGED: Final = World(count=8000, per_pad=4, families=dict.fromkeys(SHARES, 1.0), seed=7_700_103)
 _MODELS: Final = ("stsr", "mtsr", "stsr-small")
 
 
@@ -44,8 +45,7 @@ def trust_checks(bench: Workbench, report: Report) -> None:
             raise CheckpointError(f"{one.name} has no checks: export it with --trust")
     wide = bench.wide_test()
     wide = wide.pick(np.arange(12)) if bench.quick else wide
-    world = World(count=8000, per_pad=4, families=dict.fromkeys(SHARES, 1.0), seed=7_700_103)
-    fresh = freeze_presses(bench.presses("judged", world), SEED)
+    fresh = freeze_presses(bench.presses("judged", JUDGED), SEED)
     verdicts = judged(model, fresh, known_pads(fresh, False))
     report.say(
         "Shipped models through `edge.perception.runtime`, scan by scan, with its options; nothing is known of a "
