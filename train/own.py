@@ -31,6 +31,7 @@ from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, INT8_SUFFIX, find_
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.argument_types import positive
 from firmware_bridge.in_place import write_in_place
+from firmware_bridge.pad_geometry import TAXELS
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import load_sensor_file
 from train.data.frozen_presses import FrozenPresses, freeze_presses
@@ -143,36 +144,48 @@ def compared(
                 f"on {what} it is below {bundled.name} on {losing:.0%} of the pads that this may be, expected at "
                 f"most {MOST_LOSING:.0%}" + ": train on taps of the sensor (train.taps)" * bool(knowledge.pad.constants)
             )
-    holes = {name: np.array([_holes(grip, model, knowledge.pad) for grip in grips]) for name, model in models.items()}
-    for name, shares in holes.items() if grips else ():
-        rows[name]["recordings with holes"] = f"{shares.mean():.1%}"
-    for grip, mine, theirs in zip(grips, holes[OWN], holes[bundled.name], strict=True):
-        if not mine <= theirs:
-            objections.append(
-                f"in {grip.trial} {mine:.1%} of its patterns have holes, {theirs:.1%} of {bundled.name}'s: the sensor "
-                "is not as in the sensor file; lay a weight on it with edge-sr doctor"
-            )
-    if grips:  # of an operator that reads z off patterns of pads like this one
-        truths, readings = zip(*simulated, strict=True)
-        operator = fit_linear_map(np.concatenate(truths), np.concatenate(readings), 0.1)
-        squares = {
-            name: [_hidden(one, model, knowledge.pad, operator) for one in grips] for name, model in models.items()
-        }
-        recording = np.repeat(np.arange(len(grips)), [len(part) for part in squares[OWN]])
-        off = {name: np.concatenate(parts) for name, parts in squares.items()}
-        worse = off[OWN] - off[bundled.name]
-        known = np.isfinite(worse)
-        for name, values in off.items() if known.any() else ():
-            rows[name]["hidden taxel [counts]"] = f"{np.sqrt(values[known].mean()):.0f}"
-        if known.any() and bootstrap_interval(worse[known], recording[known])[0] > 0:
-            mine, theirs = (rows[name]["hidden taxel [counts]"] for name in (OWN, bundled.name))
-            objections.append(
-                f"of a taxel that is hidden it is {mine} counts off, {bundled.name} {theirs}: the sensor is not as in "
-                "the sensor file"
-            )
+    if grips:
+        truths, readings = map(np.concatenate, zip(*simulated, strict=True))
+        operator = fit_linear_map(truths, readings, 0.1)  # reads z off patterns of pads like this one
+        objections += _on_recordings(models, bundled.name, grips, knowledge.pad, operator, rows)
     for name, times in times_us.items():
         rows[name]["run time [us]"] = round(float(np.median(times)))
     return Comparison(markdown([*rows.values()]), "; ".join(objections) or None, gains)
+
+
+def _on_recordings(
+    models: Mapping[str, ModelSession],
+    bundled: str,
+    grips: Sequence[Grip],
+    pad: Pad,
+    operator: NDArray[np.floating],
+    rows: Mapping[str, Row],
+) -> list[str]:
+    """Return what speaks against OWN in recordings of grips, of which the cells of each model are put into its row."""
+    objections, holes, off = list[str](), dict[str, NDArray[np.floating]](), dict[str, NDArray[np.floating]]()
+    for name, model in models.items():
+        holes[name] = np.array([_holes(grip, model, pad) for grip in grips])
+        off[name] = np.concatenate([_hidden(grip, model, pad, operator) for grip in grips])
+        rows[name]["recordings with holes"] = f"{holes[name].mean():.1%}"
+    for grip, mine, theirs in zip(grips, holes[OWN], holes[bundled], strict=True):
+        if not mine <= theirs:
+            objections.append(
+                f"in {grip.trial} {mine:.1%} of its patterns have holes, {theirs:.1%} of {bundled}'s: the sensor "
+                "is not as in the sensor file; lay a weight on it with edge-sr doctor"
+            )
+    recording = np.repeat(np.arange(len(grips)), TAXELS)
+    worse = off[OWN] - off[bundled]
+    known = np.isfinite(worse)
+    if known.any():
+        counts = {name: f"{np.sqrt(values[known].mean()):.0f}" for name, values in off.items()}
+        for name, cell in counts.items():
+            rows[name]["hidden taxel [counts]"] = cell
+        if bootstrap_interval(worse[known], recording[known])[0] > 0:
+            objections.append(
+                f"of a taxel that is hidden it is {counts[OWN]} counts off, {bundled} {counts[bundled]}: the sensor "
+                "is not as in the sensor file; lay a weight on it with edge-sr doctor"
+            )
+    return objections
 
 
 def _holes(grip: Grip, model: ModelSession, pad: Pad) -> float:
@@ -183,10 +196,12 @@ def _holes(grip: Grip, model: ModelSession, pad: Pad) -> float:
 
 
 def _hidden(grip: Grip, model: ModelSession, pad: Pad, operator: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the mean squared error of the z of taxels, each hidden in turn, of scans (n,); NaN without a pattern."""
-    played = hidden_taxels(grip, model, operator, pad)
-    zeroed = grip.zeroed()
-    return ((played - z_of(zeroed[loaded(zeroed)])) ** 2).mean(axis=1)
+    """Return the mean squared error of the z of each taxel (TAXELS,), hidden in turn; NaN where there is no pattern."""
+    few = replace(grip, counts=grip.counts[:: max(1, len(grip.counts) // 100)])  # a recording may be of hours
+    zeroed = few.zeroed()
+    squares = (hidden_taxels(few, model, operator, pad) - z_of(zeroed[loaded(zeroed)])) ** 2
+    made = squares[np.isfinite(squares).all(axis=1)]
+    return made.mean(axis=0) if len(made) else np.full(TAXELS, np.nan)
 
 
 MOST_LOSING: Final = 0.2  # share of the pads that a sensor may be, its mean over some presses each
